@@ -1,0 +1,279 @@
+"""Open only what is safe to open, write whole files or none.
+
+Every reader passes the names found inside a survey file through `resolve_reference`, every
+declared count through `require`; every writer goes through `atomic_file` or `atomic_folder`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+import shutil
+import stat
+import unicodedata
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from meshreg.errors import InputError, OutputError, UnsafeReferenceError
+from meshreg.io.atomic import as_output_error, atomic_file, atomic_folder
+from meshreg.types import UInt8
+
+_SCHEME_OR_DRIVE = re.compile(r"[A-Za-z][A-Za-z0-9+.\-]*:")
+_COPY_BESIDE = "Copy it beside the survey file and write its plain name there."
+
+
+class MissingReferenceError(InputError):
+    """A file that another file refers to is not there (or its name fits several)."""
+
+
+def decode_name(name: bytes | str) -> str:
+    """Return a name from a file as text: UTF-8, else Latin-1 (which cannot fail)."""
+    if isinstance(name, str):
+        return name
+    try:
+        return name.decode("utf-8")
+    except UnicodeDecodeError:
+        return name.decode("latin-1")
+
+
+def resolve_reference(folder: Path, name: str | bytes, *, root: Path) -> Path:
+    """Find the file that a survey file names, never outside the survey's folder.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder of the file that holds the reference.
+    name : str or bytes
+        The reference as written. Backslashes separate folders; bytes are tried as UTF-8, as
+        Latin-1 and as the bytes of the file system. Letter case and Unicode normal form may
+        differ where only one file then fits.
+    root : Path
+        The survey's folder; the result lies in it, links followed.
+
+    Returns
+    -------
+    Path
+        An existing regular file, below `folder`.
+
+    Raises
+    ------
+    UnsafeReferenceError
+        An absolute path, a drive, a UNC path, a scheme, ``..``, a NUL byte, a link that leaves
+        `root`, or something that is not a regular file.
+    MissingReferenceError
+        No such file, or several that differ in letter case only.
+    """
+    shown = decode_name(name)
+    for text in _spellings(name):
+        parts = _safe_parts(text, shown)
+        path = _walk(Path(folder), parts, Path(root).resolve(), shown)
+        if path is not None:
+            return path
+    raise MissingReferenceError(
+        f"the file {shown!r} that is referred to is not there.",
+        file=folder,
+        remedy="Copy it there, under that name.",
+    )
+
+
+def _spellings(name: str | bytes) -> list[str]:
+    """Return the texts that a name may stand for, likeliest first, without repeats."""
+    if isinstance(name, str):
+        return [name]
+    texts = [decode_name(name), name.decode("latin-1"), os.fsdecode(name)]
+    return list(dict.fromkeys(texts))
+
+
+def _safe_parts(text: str, shown: str) -> list[str]:
+    """Split a reference into its folders and name, or say why it is refused."""
+    path = text.strip().replace("\\", "/")
+    why = ""
+    if "\0" in path:
+        why = "holds a NUL byte"
+    elif path.startswith("/"):
+        why = "is an absolute path"
+    elif _SCHEME_OR_DRIVE.match(path):
+        why = "starts with a drive or a scheme"
+    elif ".." in path.split("/"):
+        why = "climbs out of its folder by '..'"
+    if why:
+        raise UnsafeReferenceError(f"the reference {shown!r} {why}.", remedy=_COPY_BESIDE)
+    parts = [part for part in path.split("/") if part not in ("", ".")]
+    if not parts:
+        raise UnsafeReferenceError(f"the reference {shown!r} names no file.")
+    return parts
+
+
+def _walk(folder: Path, parts: list[str], root: Path, shown: str) -> Path | None:
+    """Go down from `folder`, one unique match a step, staying in `root`; None where none fits."""
+    path = folder
+    for last, part in ((index == len(parts) - 1, part) for index, part in enumerate(parts)):
+        try:
+            found = _entry(path, part, shown)
+        except (OSError, ValueError):
+            return None
+        if found is None:
+            return None
+        path = path / found
+        # Checked at every step, so that not even a listing is taken outside the root.
+        if not path.resolve().is_relative_to(root):
+            raise UnsafeReferenceError(
+                f"the reference {shown!r} is a link that leaves the survey's folder.",
+                file=path,
+                remedy="Put the file itself there instead of a link.",
+            )
+        if last and not path.is_file():
+            raise UnsafeReferenceError(
+                f"the reference {shown!r} is not a regular file.", file=path, remedy=_COPY_BESIDE
+            )
+    return path
+
+
+def _entry(folder: Path, part: str, shown: str) -> str | None:
+    """Return the entry of `folder` called `part`, else the only one that folds to it."""
+    if os.path.lexists(folder / part):
+        return part
+
+    def folded(text: str) -> str:
+        return unicodedata.normalize("NFC", unicodedata.normalize("NFC", text).casefold())
+
+    fits = [entry for entry in os.listdir(folder) if folded(entry) == folded(part)]
+    if len(fits) > 1:
+        raise MissingReferenceError(
+            f"the reference {shown!r} fits several files: {', '.join(sorted(fits))}.",
+            file=folder,
+            remedy="Keep one of them, under the name that is referred to.",
+        )
+    return fits[0] if fits else None
+
+
+def open_regular(path: Path) -> BinaryIO:
+    """Open a file for reading; anything but a regular file is refused, without blocking.
+
+    Raises
+    ------
+    InputError
+        Missing, not readable, a folder, a pipe or a device.
+    """
+    try:
+        # A look before opening: opening some devices already does something.
+        _require_regular(os.stat(path).st_mode, path)
+        handle = os.open(path, os.O_RDONLY | os.O_CLOEXEC | getattr(os, "O_NONBLOCK", 0))
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        remedy = "Check the path and its permissions."
+        raise InputError(f"cannot be opened: {reason}.", file=path, remedy=remedy) from error
+    stream = os.fdopen(handle, "rb")
+    try:
+        _require_regular(os.fstat(stream.fileno()).st_mode, path)
+    except BaseException:
+        stream.close()
+        raise
+    return stream
+
+
+def _require_regular(mode: int, path: Path) -> None:
+    if not stat.S_ISREG(mode):
+        kind = "a folder" if stat.S_ISDIR(mode) else "a pipe, socket or device"
+        raise InputError(f"is {kind}, not a file.", file=path, remedy="Name a regular file.")
+
+
+def file_bytes(path: Path) -> UInt8:
+    """Map a whole file into memory, read-only: (size,) uint8.
+
+    Raises
+    ------
+    InputError
+        As `open_regular`, and for an empty file.
+    """
+    with open_regular(path) as stream:
+        if os.fstat(stream.fileno()).st_size == 0:
+            raise InputError("is empty.", file=path, remedy="Export or copy it again.")
+        # A plain array over the map: slices of np.memmap are slow to make.
+        return np.asarray(np.memmap(stream, dtype=np.uint8, mode="r"))
+
+
+def require(
+    count: int, item_bytes: float, available: int, file: Path, place: str, what: str
+) -> None:
+    """Refuse a declared count that the bytes left in the file cannot hold, before allocating.
+
+    Parameters
+    ----------
+    count : int
+        Items declared.
+    item_bytes : float
+        Least size of one item in the file [bytes].
+    available : int
+        Bytes left in the file for them.
+    file, place, what
+        For the message: the file, where the count stands, what is counted ("vertices").
+
+    Raises
+    ------
+    InputError
+        The count is negative or needs more than `available`.
+    """
+    if int(count) < 0 or int(count) * item_bytes > available:
+        raise InputError(
+            f"declares {int(count)} {what} of at least {item_bytes:g} bytes each, "
+            f"but {int(available)} bytes are there for them.",
+            file=file,
+            place=place,
+            remedy="The file is cut off or damaged; export or copy it again.",
+        )
+
+
+def sha256(path: Path) -> str:
+    """Return the SHA-256 of a file in hexadecimal."""
+    with open_regular(path) as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()  # type: ignore[arg-type]
+
+
+def fingerprint(path: Path) -> tuple[int, int]:
+    """Return size [bytes] and time of last change [ns], to notice that a file has changed."""
+    with open_regular(path) as stream:
+        status = os.fstat(stream.fileno())
+    return status.st_size, status.st_mtime_ns
+
+
+def copy_file(source: Path, target: Path) -> None:
+    """Copy a regular file's bytes to a new file; refuse to replace one of other content.
+
+    Raises
+    ------
+    OutputError
+        `target` exists and differs, or any OSError.
+    """
+    if os.path.lexists(target):
+        if target.is_file() and sha256(target) == sha256(source):
+            return
+        raise OutputError(
+            "exists already with other content.", file=target, remedy="Choose another folder."
+        )
+    with as_output_error(target):
+        target.parent.mkdir(parents=True, exist_ok=True)
+    with (
+        open_regular(source) as stream,
+        atomic_file(target) as temporary,
+        open(temporary, "wb") as out,
+    ):
+        shutil.copyfileobj(stream, out, 1 << 20)
+
+
+__all__: list[str] = [
+    "MissingReferenceError",
+    "atomic_file",
+    "atomic_folder",
+    "copy_file",
+    "decode_name",
+    "file_bytes",
+    "fingerprint",
+    "open_regular",
+    "require",
+    "resolve_reference",
+    "sha256",
+]

@@ -1,0 +1,129 @@
+"""Sums over the overlap, for every offset in a window at once, by FFT.
+
+A moving raster laid `s` rows and columns further on the reference pairs the cells
+``reference[r + s] ~ moving[r]``. For each of the exhaustive searches all that is needed is
+``sum_r a[r + s] * b[r]`` for several pairs of arrays a, b that are zero outside their masks
+(Padfield, "Masked object registration in the Fourier domain", IEEE TIP 21(5), 2012).
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from meshreg.errors import UsageError
+from meshreg.types import Bool, Float64, Grid
+
+Complex = NDArray[np.complex128]
+WORKERS = min(2, os.cpu_count() or 1)  # fixed, so that results do not depend on the machine's size
+
+
+@dataclass(frozen=True)
+class Window:
+    """The offsets that are searched: whole cells from the nominal position.
+
+    Attributes
+    ----------
+    cell : float
+        Step of the search [m].
+    rows, cols : (K,), (L,) int
+        Shifts `s` of the moving raster's first row and column in the reference raster.
+    east, north : (L,), (K,) float64
+        The offsets [m] that they mean: what is added to moving coordinates.
+    shape : pair of pairs
+        Shapes of the reference and the moving raster.
+    """
+
+    cell: float
+    rows: NDArray[np.int64]
+    cols: NDArray[np.int64]
+    east: Float64
+    north: Float64
+    shapes: tuple[tuple[int, int], tuple[int, int]]
+
+    @classmethod
+    def around(cls, reference: Grid, moving: Grid, radius: float) -> Window:
+        """Return all offsets of up to `radius` metres east or north, on the grids' lattice.
+
+        Raises
+        ------
+        UsageError
+            If the grids differ in cell size or are not shifted by whole cells.
+        """
+        if not np.isclose(reference.cell, moving.cell, rtol=1e-9, atol=0):
+            raise UsageError(
+                f"The rasters' cells differ: {reference.cell} and {moving.cell} m.",
+                remedy="Rasterize both on the same cell.",
+            )
+        cell = reference.cell
+        row = (reference.north - moving.north) / cell
+        col = (moving.west - reference.west) / cell
+        if max(abs(row - round(row)), abs(col - round(col))) > 1e-3:
+            raise UsageError(
+                f"The rasters' grids are {row:.4f} rows and {col:.4f} columns apart, "
+                "not a whole number.",
+                remedy="Snap both to one lattice (meshreg.raster.survey_grid).",
+            )
+        reach = max(1, int(np.floor(radius / cell + 1e-6)))
+        steps = np.arange(-reach, reach + 1)
+        return cls(
+            cell,
+            steps + round(row),
+            steps + round(col),
+            steps * cell,
+            -steps * cell,
+            (reference.shape, moving.shape),
+        )
+
+    @property
+    def padded(self) -> tuple[int, int]:
+        """Smallest FFT size at which no offset in the window wraps round."""
+        from scipy.fft import next_fast_len
+
+        sizes = []
+        for axis, shifts in enumerate((self.rows, self.cols)):
+            n_reference, n_moving = self.shapes[0][axis], self.shapes[1][axis]
+            need = max(n_reference, n_moving, n_reference - shifts[0], n_moving + shifts[-1])
+            # axis 1 is the real transform's, which likes its own sizes
+            sizes.append(int(next_fast_len(int(need), real=axis == 1)))
+        return sizes[0], sizes[1]
+
+
+@dataclass(frozen=True)
+class Correlator:
+    """Masked sums over the window's offsets; each array is transformed once and reused."""
+
+    window: Window
+
+    def transform(self, array: Any) -> Complex:
+        """Forward transform of one raster, zero outside its mask."""
+        from scipy.fft import rfft2
+
+        array = np.asarray(array, np.float64)
+        return np.asarray(rfft2(array, s=self.window.padded, workers=WORKERS))
+
+    def sums(self, *pairs: tuple[Complex, Complex]) -> Float64:
+        """``sum over pairs of sum_r a[r + s] b[r]`` for each offset, (K, L) float64."""
+        from scipy.fft import irfft2
+
+        product = pairs[0][0] * np.conj(pairs[0][1])
+        for a, b in pairs[1:]:
+            product += a * np.conj(b)
+        size = self.window.padded
+        whole = irfft2(product, s=size, workers=WORKERS)
+        rows, cols = self.window.rows % size[0], self.window.cols % size[1]
+        return np.ascontiguousarray(whole[np.ix_(rows, cols)])
+
+    def counts(self, a: Complex, b: Complex) -> Float64:
+        """Like `sums`, of two masks: whole numbers."""
+        return np.rint(self.sums((a, b)))
+
+
+def overlap_floor(counts: Float64, share: float) -> Bool:
+    """Return where the overlap is large enough to be scored: `share` of the largest in the window."""
+    largest = float(counts.max()) if counts.size else 0.0
+    return np.asarray(counts >= max(share * largest, 1.0))

@@ -1,0 +1,60 @@
+"""Compiled loops of the estimators. Their readable twins are in `tests/reference_offsets.py`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from meshreg.jit import jit, prange
+
+
+@jit(parallel=True, nogil=True)
+def direct_information(
+    first: Any, second: Any, rows: Any, cols: Any, scored: Any, bins: int
+) -> Any:
+    """Mutual information (nat) of two level images for each offset; levels under 0 are masked."""
+    surface = np.zeros((len(rows), len(cols)))
+    height1, width1 = first.shape
+    height2, width2 = second.shape
+    for i in prange(len(rows)):
+        # bin `bins` takes the masked cells, so that the inner loop has no branch
+        joint = np.zeros((bins + 1, bins + 1), np.int32)
+        for j in range(len(cols)):
+            if not scored[i, j]:
+                continue
+            joint[:] = 0
+            shift_row, shift_col = rows[i], cols[j]
+            first_col = max(0, -shift_col)
+            last_col = min(width2, width1 - shift_col)
+            for r in range(max(0, -shift_row), min(height2, height1 - shift_row)):
+                for c in range(first_col, last_col):
+                    joint[first[r + shift_row, c + shift_col], second[r, c]] += 1
+            surface[i, j] = _information(joint, bins)
+    return surface
+
+
+@jit(nogil=True)
+def _information(joint: Any, bins: int) -> float:
+    """H1 + H2 - H12 of the counts in the first `bins` rows and columns."""
+    total = 0
+    joint_sum = 0.0
+    marginal = np.zeros(bins, np.int64)
+    marginal_sum = 0.0
+    for a in range(bins):
+        row = 0
+        for b in range(bins):
+            count = joint[a, b]
+            if count > 0:
+                row += count
+                marginal[b] += count
+                joint_sum += count * np.log(count)
+        if row > 0:
+            marginal_sum += row * np.log(row)
+            total += row
+    for b in range(bins):
+        if marginal[b] > 0:
+            marginal_sum += marginal[b] * np.log(marginal[b])
+    if total == 0:
+        return 0.0
+    return (joint_sum - marginal_sum) / total + np.log(total)

@@ -1,0 +1,134 @@
+"""III-D: scan the offsets for the one at which the two mosaics share most information.
+
+With the joint histogram J of the two grey images over the overlap, divided by its count N, the
+mutual information is ``H1 + H2 - H12`` (natural logarithm). Equation (2) of the paper is printed
+with a minus before its last term, which would make it the joint entropy's negative twice over;
+the sum of the marginal entropies less the joint one is meant and is computed here.
+
+Counts for all offsets at once come from correlating the level sets ``[A = a]`` and ``[B = b]``
+(Öfverstedt, Lindblad and Sladoje, Pattern Recognition Letters 159, 2022).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from meshreg.offsets.channels import grey, local_normalised
+from meshreg.offsets.correlate import Correlator, Window, overlap_floor
+from meshreg.offsets.surface import Peak, find_peak
+from meshreg.settings import Settings
+from meshreg.types import Bool, Float64, SurveyRaster
+
+
+def scan(
+    reference: SurveyRaster, moving: SurveyRaster, settings: Settings, window: Window
+) -> tuple[Peak | None, float, Mapping[str, Any]]:
+    """Score every offset in the window; return the peak, the information at it, the surface."""
+    options, share = settings.mutual_information, settings.search.min_overlap
+    first, second = (
+        levels(raster, options.bins, options.high_pass) for raster in (reference, moving)
+    )
+    masks = reference.color_valid, moving.color_valid
+    if options.direct:
+        surface, counts = direct_surface(first, second, masks, window, share, options.bins)
+        quality = surface
+    else:
+        surface, counts = fft_surface(first, second, masks, window, share, options.bins)
+        quality = without_small_sample_bias(surface, counts) * counts
+    peak = find_peak(quality, window.east, window.north, exclusion=max(0.5, 3 * window.cell))
+    evidence = {"surface": surface, "lower_is_better": False, "counts": counts}
+    return peak, float(surface[peak.index]) if peak else float("nan"), evidence
+
+
+def levels(raster: SurveyRaster, bins: int, high_pass: float) -> Any:
+    """(H, W) uint8 level of each cell, under `bins`.
+
+    `high_pass` 0 is the paper's raw grey in equal bins of 0-255. Otherwise the grey is locally
+    normalised (sigma in metres) and cut at its own quantiles, so that all levels are used.
+    """
+    field = grey(raster)
+    if high_pass <= 0:
+        return np.minimum(np.rint(field) * bins // 256, bins - 1).astype(np.uint8)
+    mask = raster.color_valid
+    sigma = max(high_pass / raster.grid.cell, 2.0)
+    field = local_normalised(field, mask, sigma)
+    if not mask.any():
+        return np.zeros(field.shape, np.uint8)
+    edges = np.quantile(field[mask], np.linspace(0, 1, bins + 1)[1:-1])
+    return np.searchsorted(edges, field, side="right").astype(np.uint8)
+
+
+def direct_surface(
+    first: Any,
+    second: Any,
+    masks: tuple[Bool, Bool],
+    window: Window,
+    min_overlap: float,
+    bins: int,
+) -> tuple[Float64, Float64]:
+    """Count each offset's joint histogram cell by cell (the paper's way)."""
+    from meshreg.offsets.kernels import direct_information
+
+    correlator = Correlator(window)
+    counts = correlator.counts(*(correlator.transform(mask) for mask in masks))
+    scored = overlap_floor(counts, min_overlap)
+    a = np.where(masks[0], first, -1).astype(np.int16)
+    b = np.where(masks[1], second, -1).astype(np.int16)
+    surface = direct_information(a, b, window.rows, window.cols, scored, bins)
+    return np.where(scored, surface, np.nan), counts
+
+
+def fft_surface(
+    first: Any,
+    second: Any,
+    masks: tuple[Bool, Bool],
+    window: Window,
+    min_overlap: float,
+    bins: int,
+) -> tuple[Float64, Float64]:
+    """Return the same surface from the correlations of all pairs of level sets.
+
+    ``MI = (sum n_ab ln n_ab - sum n_a ln n_a - sum n_b ln n_b) / N + ln N``, with the marginal
+    counts n_a, n_b taken over the overlap too.
+    """
+    correlator = Correlator(window)
+    mask1, mask2 = (correlator.transform(mask) for mask in masks)
+    counts = correlator.counts(mask1, mask2)
+    scored = overlap_floor(counts, min_overlap)
+    joint, marginals = np.zeros(counts.shape), np.zeros(counts.shape)
+    sets2 = [correlator.transform((second == b) & masks[1]) for b in range(bins)]
+    for b in sets2:
+        marginals += _n_log_n(correlator.counts(mask1, b))
+    for a in range(bins):
+        set1 = correlator.transform((first == a) & masks[0])
+        marginals += _n_log_n(correlator.counts(set1, mask2))
+        for b in sets2:
+            joint += _n_log_n(correlator.counts(set1, b))
+    n = np.maximum(counts, 1.0)
+    information = (joint - marginals) / n + np.log(n)
+    return np.where(scored, information, np.nan), counts
+
+
+def without_small_sample_bias(surface: Float64, counts: Float64) -> Float64:
+    """Subtract what unrelated images of this size would show: a multiple of 1/N.
+
+    The plain estimate exceeds the truth by about (cells filled)/2N, which favours small
+    overlaps; with correlated pixels the multiple is larger, so it is fitted: the median of
+    ``MI * N`` over the window, since all but a few offsets are unrelated.
+    """
+    finite = np.isfinite(surface)
+    if not finite.any():
+        return surface
+    multiple = float(np.median((surface * counts)[finite]))
+    return surface - multiple / np.maximum(counts, 1.0)
+
+
+def _n_log_n(counts: Float64) -> Float64:
+    from scipy.special import xlogy
+
+    return np.asarray(xlogy(counts, counts))
+
+
