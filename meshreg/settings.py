@@ -80,8 +80,10 @@ class JudgeSettings:
 
     agree_distance: float = 0.25  # [m], or 2.5 DEM cells where that is more
     min_overlap: float = 0.25
+    support_gap: float = 1.5  # a channel that puts a place first by this much supports it
     accept_gap: float = 4.0
     overwhelming_gap: float = 8.0
+    max_false_alarm: float = 1e-6
 
 
 @dataclass(frozen=True)

@@ -119,12 +119,13 @@ def _encode(value: Any, indent: str) -> str:
             raise UsageError(f"{value} cannot be said in JSON.")
         text = format(value, ".17g")
         return text if re.search(r"[.e]", text) else text + ".0"  # a float stays a float
-    if value is None or isinstance(value, str | bool | int):
-        # Lone surrogates (file names that are no UTF-8) must not break the writing.
+    if isinstance(value, str):
+        return _quoted(value)
+    if value is None or isinstance(value, bool | int):
         return json.dumps(value)
     inner = indent + "  "
     if isinstance(value, dict):
-        items = [f"{json.dumps(str(key))}: {_encode(item, inner)}" for key, item in value.items()]
+        items = [f"{_quoted(str(key))}: {_encode(item, inner)}" for key, item in value.items()]
         brackets = "{}"
     elif isinstance(value, list | tuple):
         items = [_encode(item, inner) for item in value]
@@ -137,6 +138,14 @@ def _encode(value: Any, indent: str) -> str:
         return brackets
     body = f",\n{inner}".join(items)
     return f"{brackets[0]}\n{inner}{body}\n{indent}{brackets[1]}"
+
+
+def _quoted(text: str) -> str:
+    try:
+        text.encode("utf-8")
+    except UnicodeEncodeError:  # a file name that is no UTF-8
+        return json.dumps(text)
+    return json.dumps(text, ensure_ascii=False)
 
 
 def read_registration(path: str | Path) -> Registration:

@@ -1,0 +1,259 @@
+"""The seafloor as a function: height and reflectance at any point, for a site, a seed, an epoch."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data_synth import types as t
+from data_synth.colonies import place, uniform
+
+Float64 = NDArray[np.float64]
+Bounds = tuple[float, float, float, float]  # west, south, east, north [m]
+BIN = 0.25  # side of a cell of the feature index [m]
+
+
+@dataclass(frozen=True)
+class Site:
+    """What a piece of seafloor is made of. Lengths in metres, densities per square metre.
+
+    `relief` to `grit` shape the rock, `sand` is the share of the ground under sand, `rubble`,
+    `turf` and `coralline` its cover (0..1); then follow what stands on it. The defaults give the
+    roughness spectrum and slopes of a real reef flat (`docs/seafloor_vs_reef.png`).
+    """
+
+    relief: float = 0.10
+    relief_wavelength: float = 8.0
+    hurst: float = 0.75
+    step: float = 0.25
+    step_wavelength: float = 4.0
+    step_level: float = 0.5
+    lump: float = 0.16
+    lump_cell: float = 1.1
+    lump_gain: float = 0.60
+    grit: float = 0.008
+    sand: float = 0.0
+    sand_relief: float = 0.02
+    ripple: float = 0.012
+    ripple_wavelength: float = 0.14
+    ripple_wander: float = 0.9
+    rubble: float = 0.3
+    turf: float = 0.8
+    coralline: float = 0.5
+    tone: tuple[float, float, float] = (1.0, 0.93, 0.80)
+    sand_tone: tuple[float, float, float] = (0.46, 0.41, 0.31)
+    boulder: float = 0.0
+    boulder_size: float = 1.0
+    massive: float = 1.2
+    branching: float = 0.8
+    plate: float = 0.25
+    encrusting: float = 1.5
+    soft: float = 0.4
+    sponge: float = 0.1
+    urchin: float = 0.1
+    kelp: float = 0.0
+    coral_size: float = 1.0
+    cluster: float = 0.7  # 0 evenly strewn .. 1 in stands with bare ground between
+    near_light: float = 1.0
+
+    def densities(self) -> dict[int, float]:
+        """Return things per square metre by kind."""
+        return {
+            t.BOULDER: self.boulder,
+            t.MASSIVE: self.massive,
+            t.BRANCHING: self.branching,
+            t.PLATE: self.plate,
+            t.ENCRUSTING: self.encrusting,
+            t.SOFT: self.soft,
+            t.SPONGE: self.sponge,
+            t.URCHIN: self.urchin,
+            t.KELP: self.kelp,
+        }
+
+
+def bare_ground(site: Site, seed: int) -> t.Ground:
+    """Return the numbers of the rock alone, without its sand."""
+    return t.Ground(
+        seed=seed,
+        relief=site.relief,
+        relief_wavelength=site.relief_wavelength,
+        hurst=site.hurst,
+        step=site.step,
+        step_wavelength=site.step_wavelength,
+        step_level=site.step_level,
+        lump=site.lump,
+        lump_cell=site.lump_cell,
+        lump_gain=site.lump_gain,
+        grit=site.grit,
+        sand_level=-1e9,
+        sand_relief=site.sand_relief,
+        ripple=site.ripple,
+        ripple_wavelength=site.ripple_wavelength,
+        ripple_turn=float(uniform(np.array([0]), 90, seed)[0] * math.pi),
+        ripple_wander=site.ripple_wander,
+        ripple_phase=0.0,
+        rubble=site.rubble,
+        turf=site.turf,
+        coralline=site.coralline,
+        tone_red=site.tone[0],
+        tone_green=site.tone[1],
+        tone_blue=site.tone[2],
+        sand_red=site.sand_tone[0],
+        sand_green=site.sand_tone[1],
+        sand_blue=site.sand_tone[2],
+        mix=0.0,
+        mix_seed=0,
+    )
+
+
+@lru_cache(maxsize=64)
+def ground_of(site: Site, seed: int) -> t.Ground:
+    """Return the ground's numbers; the sand stands so high that it covers `site.sand` of 30 m."""
+    from data_synth.seafloor_kernels import evaluate_ground
+
+    ground = bare_ground(site, seed)
+    if site.sand <= 0.0:
+        return ground
+    side = np.linspace(-15.0, 15.0, 61)
+    x, y = (a.ravel() for a in np.meshgrid(side, side))
+    rock, _ = evaluate_ground(x, y, ground, 0.05)
+    level = np.quantile(rock, min(site.sand, 1.0)) + (0.5 if site.sand >= 1.0 else 0.0)
+    return ground._replace(sand_level=float(level))
+
+
+@dataclass(frozen=True, eq=False)
+class Seafloor:
+    """One epoch of a piece of the world: `bounds` says where its features are complete.
+
+    Attributes
+    ----------
+    ground : Ground
+    features : (N,) structured array of `data_synth.types.FEATURE`
+    bounds : west, south, east, north [m]
+    """
+
+    ground: t.Ground
+    features: NDArray[np.void]
+    bounds: Bounds
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "_index", _index(self.features, self.bounds))
+
+    def evaluate(
+        self, x: Float64, y: Float64, finest: float = 0.0
+    ) -> tuple[Float64, NDArray[np.float32], NDArray[np.int32]]:
+        """Return height [m], reflectance (..., 3) and the number of the feature on top.
+
+        Parameters
+        ----------
+        x, y : float64 arrays of one shape
+            World coordinates [m].
+        finest : float
+            Relief and texture shorter than this wavelength [m] are left out (they average to
+            nothing over samples twice as dense).
+
+        Returns
+        -------
+        height : float64, reflectance : float32, winner : int32
+            `winner` indexes `features`; -1 is bare ground.
+        """
+        from data_synth.seafloor_kernels import evaluate
+
+        height, color, winner = evaluate(*self._points(x, y), finest)
+        return height.reshape(x.shape), color.reshape(*x.shape, 3), winner.reshape(x.shape)
+
+    def height(self, x: Float64, y: Float64, finest: float = 0.0) -> Float64:
+        """Return the height [m] at world coordinates `x`, `y` [m]."""
+        from data_synth.seafloor_kernels import evaluate_height
+
+        height: Float64 = evaluate_height(*self._points(x, y), finest).reshape(x.shape)
+        return height
+
+    def _points(self, x: Float64, y: Float64) -> tuple[object, ...]:
+        x = np.ascontiguousarray(x, np.float64).ravel()
+        y = np.ascontiguousarray(y, np.float64).ravel()
+        return (x, y, self.ground, self.features, *self._index)  # type: ignore[attr-defined]
+
+
+def _index(
+    features: NDArray[np.void], bounds: Bounds
+) -> tuple[NDArray[np.int64], NDArray[np.int64], Float64, Float64]:
+    """List for each cell of a lattice the features that may reach it (compressed rows)."""
+    west, south, east, north = bounds
+    cols = max(1, math.ceil((east - west) / BIN))
+    rows = max(1, math.ceil((north - south) / BIN))
+    low_col = np.clip(np.floor((features["x"] - features["reach"] - west) / BIN), 0, cols)
+    high_col = np.clip(np.floor((features["x"] + features["reach"] - west) / BIN) + 1, 0, cols)
+    low_row = np.clip(np.floor((features["y"] - features["reach"] - south) / BIN), 0, rows)
+    high_row = np.clip(np.floor((features["y"] + features["reach"] - south) / BIN) + 1, 0, rows)
+    cells, members = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
+    for k in range(len(features)):
+        r = np.arange(low_row[k], high_row[k], dtype=np.int64)
+        c = np.arange(low_col[k], high_col[k], dtype=np.int64)
+        both = (r[:, None] * cols + c).ravel()
+        cells.append(both)
+        members.append(np.full(len(both), k, np.int64))
+    cell, member = np.concatenate(cells), np.concatenate(members)
+    order = np.argsort(cell, kind="stable")
+    starts = np.searchsorted(cell[order], np.arange(rows * cols + 1))
+    corner, bins = np.array([west, south]), np.array([cols, rows, BIN])
+    return starts.astype(np.int64), member[order], corner, bins
+
+
+def features_of(site: Site, seed: int, bounds: Bounds) -> NDArray[np.void]:
+    """Return what stands in `bounds` at the first epoch, sorted by id.
+
+    Corals keep to stands (`site.cluster`) and off the sand; everything knows the height of the
+    ground below it.
+    """
+    from data_synth.seafloor_kernels import evaluate_ground, evaluate_noise
+
+    ground = ground_of(site, seed)
+    kept = []
+    for rows in place(site, seed, bounds):
+        kind = int(rows["kind"][0]) if len(rows) else 0
+        height, sandy = evaluate_ground(rows["x"].copy(), rows["y"].copy(), ground, 0.10)
+        stand = evaluate_noise(rows["x"].copy(), rows["y"].copy(), seed + 70 + kind % 3, 3.5)
+        chance = 1.0 - site.cluster * (0.5 - 0.5 * np.tanh(1.5 * stand))
+        chance = np.where(sandy > 0.3, 0.35 if kind == t.BOULDER else 0.03, chance)
+        rows["z"] = height
+        alive = uniform(rows["id"], 11, seed) < chance
+        kept.append(rows[alive])
+    everything = np.concatenate(kept) if kept else np.zeros(0, t.FEATURE)
+    west, south, east, north = bounds
+    x, y, r = everything["x"], everything["y"], everything["reach"]
+    near = (x + r > west) & (x - r < east) & (y + r > south) & (y - r < north)
+    everything = everything[near]
+    return everything[np.argsort(everything["id"], kind="stable")]
+
+
+Evaluator = Callable[[Float64, Float64, float], tuple[Float64, NDArray[np.float32], NDArray[np.int32]]]
+
+
+def make_seafloor(site: Site, seed: int, bounds: Bounds) -> Seafloor:
+    """Return the first epoch of the world `seed` within `bounds`."""
+    return Seafloor(ground_of(site, seed), features_of(site, seed, bounds), bounds)
+
+
+SITES: dict[str, Site] = {
+    "reef": Site(),
+    "low_reef": replace(
+        Site(), relief=0.07, step=0.10, lump=0.08, boulder=0.0, massive=1.6, branching=1.4, plate=0.4,
+        coral_size=0.7, sand=0.18,
+    ),
+    "boulders": replace(
+        Site(), relief=0.12, step=0.0, lump=0.05, lump_gain=0.5, boulder=1.1, massive=0.0, branching=0.0,
+        plate=0.0, encrusting=1.2, soft=0.3, sponge=0.8, urchin=0.8, kelp=0.15, sand=0.25,
+        tone=(0.75, 0.72, 0.68), sand_tone=(0.36, 0.33, 0.27), coralline=0.9, rubble=0.35,
+    ),
+    "reef_and_sand": replace(Site(), sand=0.45, step=0.35, step_level=0.3, massive=0.9),
+    "sand": replace(
+        Site(), relief=0.02, step=0.0, lump=0.02, sand=1.0, massive=0.0, branching=0.0, plate=0.0,
+        encrusting=0.0, soft=0.0, sponge=0.0, urchin=0.02, rubble=0.0,
+    ),
+}

@@ -1,0 +1,254 @@
+"""From what a reader found in a file to a `Survey`: the cleaning that all formats share."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from meshreg.errors import InputError
+from meshreg.io.frames import place
+from meshreg.io.options import ReadOptions
+from meshreg.io.polygons import usable_faces
+from meshreg.io.safe import fingerprint, sha256
+from meshreg.types import Bool, Int32, Mesh, PointCloud, SourceFile, Survey, Texture, UInt8
+
+_LOG = logging.getLogger("meshreg")
+_MOST_LOST = 0.01  # share of points that may be NaN or infinite
+_MOST_WRAPPED = 0.01  # share of texture coordinates that may lie outside the page unsaid
+_AXES = np.eye(3)
+
+
+@dataclass(frozen=True, eq=False)
+class RawGeometry:
+    """Points, and triangles if any, in the file's own coordinates.
+
+    Attributes
+    ----------
+    points : (V, 3) float
+        May hold NaN and infinity.
+    faces : (F, 3) int32 or None
+        All within `points`; None for a point cloud.
+    colors : (V, 3) uint8 or None
+    uv : (F, 3, 2) float32 or None
+    face_texture : (F,) int32 or None
+        -1 where a face has no texture.
+    textures : tuple of Texture
+    """
+
+    points: NDArray[Any]
+    faces: Int32 | None = None
+    colors: UInt8 | None = None
+    uv: NDArray[np.float32] | None = None
+    face_texture: Int32 | None = None
+    textures: tuple[Texture, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """What a reader knows beside the geometry.
+
+    Attributes
+    ----------
+    format : str
+        Key in `meshreg.io.REWRITERS`.
+    notes : tuple of str
+    companions : tuple of Path
+    counts : mapping
+        As the file declares them.
+    axes : (3, 3) float64
+        Of the format, where neither user nor sidecar says otherwise.
+    crs : str or None
+        Found in the file.
+    """
+
+    format: str
+    notes: tuple[str, ...] = ()
+    companions: tuple[Path, ...] = ()
+    counts: Mapping[str, int] = field(default_factory=dict)
+    axes: NDArray[np.float64] = field(default_factory=lambda: _AXES)
+    crs: str | None = None
+
+
+def assemble_survey(path: Path, raw: RawGeometry, found: Found, options: ReadOptions) -> Survey:
+    """Clean a file's geometry, put it in place and make a `Survey` of it.
+
+    Points that are not finite go, with their faces (over 1 % are refused); so do faces without
+    area, faces that repeat another's vertices, and vertices that no face uses.
+
+    Raises
+    ------
+    InputError
+        Nothing usable is left, or over 1 % of the points are not finite.
+    """
+    raw, notes = _without_lost_points(raw, path)
+    if raw.faces is not None:
+        raw, more = _without_idle_faces(raw, path)
+        notes += more
+        notes += _uv_notes(raw)
+    if not len(raw.points):
+        raise InputError("holds no points.", file=path, remedy="Export it again.")
+    notes = (*found.notes, *notes)
+    for note in notes:
+        _LOG.warning("%s: %s", path.name, note)
+    placed = place(path, raw.points, options, found.crs, found.axes)
+    geometry: Mesh | PointCloud
+    if raw.faces is None:
+        geometry = PointCloud(placed.points, raw.colors)
+    else:
+        geometry = Mesh(
+            placed.points, raw.faces, raw.colors, raw.uv, raw.face_texture, raw.textures
+        )
+    source = SourceFile(
+        path=path,
+        format=found.format,
+        frame=placed.frame,
+        companions=found.companions,
+        sidecar=placed.sidecar,
+        sha256=sha256(path),
+        fingerprint=fingerprint(path),
+        counts=found.counts,
+    )
+    return Survey(
+        name=placed.name or path.stem,
+        geometry=geometry,
+        origin=placed.origin,
+        crs=placed.frame.crs,
+        date=placed.date,
+        source=(source,),
+        notes=(*notes, *placed.notes),
+    )
+
+
+def _keep_points(raw: RawGeometry, keep: Bool) -> RawGeometry:
+    """Leave out points; faces must not use them any more."""
+    faces = raw.faces
+    if faces is not None:
+        new = np.cumsum(keep, dtype=np.int32) - np.int32(1)
+        faces = new[faces]
+    colors = None if raw.colors is None else raw.colors[keep]
+    return replace(raw, points=raw.points[keep], faces=faces, colors=colors)
+
+
+def _keep_faces(raw: RawGeometry, keep: Bool) -> RawGeometry:
+    assert raw.faces is not None
+    changes: dict[str, Any] = {"faces": raw.faces[keep]}
+    if raw.uv is not None and raw.face_texture is not None:
+        changes |= {"uv": raw.uv[keep], "face_texture": raw.face_texture[keep]}
+    return replace(raw, **changes)
+
+
+def _without_lost_points(raw: RawGeometry, path: Path) -> tuple[RawGeometry, tuple[str, ...]]:
+    """Leave out points that are not finite, and the faces that touch them."""
+    finite = np.isfinite(raw.points).all(axis=1)
+    lost = len(finite) - int(np.count_nonzero(finite))
+    if not lost:
+        return raw, ()
+    if lost > _MOST_LOST * len(finite):
+        first = int(np.flatnonzero(~finite)[0])
+        raise InputError(
+            f"has {lost} points of {len(finite)} that are NaN or infinite "
+            f"(more than {_MOST_LOST:.0%}).",
+            file=path,
+            place=f"vertex {first + 1}",
+            remedy="Remove them in the program that made the file, or export it again.",
+        )
+    text = f"{lost} points that are NaN or infinite were dropped"
+    if raw.faces is not None:
+        whole = finite[raw.faces].all(axis=1)
+        text += f", with {len(whole) - int(np.count_nonzero(whole))} faces that touch them"
+        raw = _keep_faces(raw, whole)
+    return _keep_points(raw, finite), (text + ".",)
+
+
+def _without_idle_faces(raw: RawGeometry, path: Path) -> tuple[RawGeometry, tuple[str, ...]]:
+    """Leave out faces without area and copies, then vertices that no face uses."""
+    assert raw.faces is not None
+    keep, notes = usable_faces(np.asarray(raw.points, np.float64), raw.faces)
+    if keep is not None:
+        raw = _keep_faces(raw, keep)
+    assert raw.faces is not None
+    if not len(raw.faces):
+        raise InputError("holds no usable face.", file=path, remedy="Export it again.")
+    used = np.zeros(len(raw.points), np.bool_)
+    used[raw.faces.reshape(-1)] = True
+    idle = len(used) - int(np.count_nonzero(used))
+    if idle:
+        raw = _keep_points(raw, used)
+        notes += (f"{idle} vertices that no face uses were left out.",)
+    return raw, notes
+
+
+def _uv_notes(raw: RawGeometry) -> tuple[str, ...]:
+    """Say when texture coordinates leave the page, where they wrap or take the edge's colour."""
+    if raw.uv is None or raw.face_texture is None:
+        return ()
+    textured = raw.face_texture >= 0
+    outside = ((raw.uv < -1e-4) | (raw.uv > 1 + 1e-4)).any(axis=2)
+    n_outside = int(np.count_nonzero(outside[textured]))
+    share = n_outside / max(3 * int(np.count_nonzero(textured)), 1)
+    if share <= _MOST_WRAPPED:
+        return ()
+    return (f"{share:.1%} of the texture coordinates lie outside 0-1 and wrap around.",)
+
+
+def without_broken_uv(
+    uv: NDArray[np.float32], face_texture: Int32
+) -> tuple[NDArray[np.float32], Int32, tuple[str, ...]]:
+    """Take the texture off faces whose texture coordinates are not finite.
+
+    Returns
+    -------
+    uv : (F, 3, 2) float32
+        Zero on those faces.
+    face_texture : (F,) int32
+        -1 on those faces.
+    notes : tuple of str
+    """
+    good = np.isfinite(uv).all(axis=(1, 2))
+    lost = int(np.count_nonzero(~good & (face_texture >= 0)))
+    if good.all():
+        return uv, face_texture, ()
+    uv = np.where(good[:, None, None], uv, np.float32(0))
+    face_texture = np.where(good, face_texture, np.int32(-1))
+    note = f"{lost} faces have texture coordinates that are not finite; they get no colour."
+    return uv, face_texture, (note,) if lost else ()
+
+
+def eight_bit_colors(values: NDArray[Any]) -> tuple[UInt8, tuple[str, ...]]:
+    """Turn colours of any stored type (N, 3) into 8 bits.
+
+    8-bit values stay. 16-bit ones are divided by 257, unless none is above 255: then they hold
+    8-bit values. Floats are 0-1, unless one is above 1: then they are 0-255. Other integers are
+    0-255.
+    """
+    values = np.asarray(values)
+    if values.dtype == np.uint8:
+        return np.ascontiguousarray(values), ()
+    if not values.size:
+        return np.zeros((0, 3), np.uint8), ()
+    if values.dtype.kind == "f":
+        finite = np.isfinite(values)
+        scaled = np.where(finite, values, 0).astype(np.float64)
+        lost = int(np.count_nonzero(~finite.all(axis=1)))
+        notes = [f"{lost} colours that are not finite became black."] if lost else []
+        if scaled.max() <= 1.0:
+            scaled *= 255
+        else:
+            notes.append("Colours are fractional numbers above 1; they were taken as 0-255.")
+    else:
+        scaled = values.astype(np.float64)
+        notes = []
+        if values.dtype == np.uint16 and values.max() > 255:
+            scaled /= 257
+        elif values.dtype == np.uint16:
+            notes.append("Colours have 8-bit values in 16-bit fields; they were taken as 0-255.")
+    outside = (scaled < -0.5) | (scaled > 255.5)
+    if outside.any():
+        notes.append(f"{int(outside.any(axis=1).sum())} colours outside 0-255 were clipped.")
+    return np.clip(np.rint(scaled), 0, 255).astype(np.uint8), tuple(notes)

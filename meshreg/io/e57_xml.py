@@ -1,0 +1,364 @@
+"""The paged container of an E57 file and the XML in it, read without trusting either.
+
+An E57 file (ASTM E2807) is a row of 1024-byte pages, each ending in the CRC-32C of its first 1020
+bytes. A 48-byte header says where the XML section lies that describes scans, poses and fields.
+libE57Format hands this XML to a parser that follows external entities, so it is checked here
+first; and a registration only has to rewrite the poses in it, so every other byte can stay.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+from dataclasses import dataclass, field
+from pathlib import Path
+from xml.parsers import expat
+
+import numpy as np
+
+from meshreg.errors import InputError, ResourceLimitError, UnsafeReferenceError
+from meshreg.io.safe import file_bytes
+from meshreg.types import Float64, UInt8
+
+PAGE = 1024
+PAYLOAD = PAGE - 4
+MAX_XML = 100_000_000
+MAX_DEPTH = 64
+_HEADER = struct.Struct("<8sIIQQQQ")
+_AGAIN = "The file is cut off or damaged; export or copy it again."
+
+
+@dataclass(frozen=True)
+class Field:
+    """One field of a scan's points, as the prototype declares it; its width in bits."""
+
+    name: str
+    bits: int
+    minimum: float
+    maximum: float
+
+
+@dataclass
+class Entry:
+    """One child of `data3D` (a scan) or `images2D` in the XML.
+
+    `pose` is the byte span of its pose element, or the empty span where one can be put in.
+    `rotation` is a unit quaternion w, x, y, z.
+    """
+
+    kind: str
+    pose: tuple[int, int] = (0, 0)
+    rotation: Float64 = field(default_factory=lambda: np.array([1.0, 0.0, 0.0, 0.0]))
+    translation: Float64 = field(default_factory=lambda: np.zeros(3))
+    count: int = 0
+    fields: dict[str, Field] = field(default_factory=dict)
+    limits: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Layout:
+    """What the header and the XML of an E57 file say."""
+
+    xml: bytes
+    xml_start: int
+    xml_is_last: bool
+    entries: tuple[Entry, ...]
+    crs: str | None
+    crs_span: tuple[int, int]
+
+    @property
+    def scans(self) -> tuple[Entry, ...]:
+        """The scans, in file order."""
+        return tuple(entry for entry in self.entries if entry.kind == "data3D")
+
+
+def read_layout(path: Path) -> Layout:
+    """Check header, pages and XML of an E57 file and list its scans; no point is read.
+
+    Raises
+    ------
+    UnsafeReferenceError
+        The XML holds a DOCTYPE or ENTITY declaration.
+    InputError
+        Not an E57 file, cut off, or an XML section that is not what the standard allows.
+    ResourceLimitError
+        An XML section over 100 MB.
+    """
+    data = file_bytes(path)
+    start, length = _check_header(data, path)
+    logical_start = to_logical(start)
+    xml = _logical(data, logical_start, length)
+    _refuse_declarations(xml, path)
+    walk = _parse(xml, path)
+    is_last = (logical_start + length + PAYLOAD - 1) // PAYLOAD * PAGE >= data.size
+    layout = Layout(xml, logical_start, is_last, tuple(walk.entries), walk.crs, walk.crs_span)
+    for number, scan in enumerate(layout.scans):
+        _check_count(scan, number, data.size, path)
+    return layout
+
+
+def _check_header(data: UInt8, path: Path) -> tuple[int, int]:
+    """Return the XML section's physical offset and logical length."""
+
+    def refuse(message: str, remedy: str = _AGAIN) -> InputError:
+        return InputError(message, file=path, place="header", remedy=remedy)
+
+    if data.size < _HEADER.size or data[:8].tobytes() != b"ASTM-E57":
+        raise refuse("is not an E57 file (it does not start with ASTM-E57).")
+    _, major, _, size, start, length, page = _HEADER.unpack(data[:48].tobytes())
+    if major != 1:
+        raise refuse(f"is E57 version {major}; version 1 is known.", "Export it as E57 1.0.")
+    if page != PAGE:
+        raise refuse(f"declares pages of {page} bytes; E57 1.0 has {PAGE}.")
+    if size != data.size or size % PAGE:
+        raise refuse(f"declares {size} bytes, but the file has {data.size}.")
+    if start < _HEADER.size or start >= size or start % PAGE >= PAYLOAD:
+        raise refuse(f"places its XML section at byte {start} of {size}.")
+    if length > MAX_XML:
+        raise ResourceLimitError(
+            f"declares an XML section of {length} bytes; {MAX_XML} are the limit.", file=path
+        )
+    if to_logical(start) + length > size // PAGE * PAYLOAD:
+        raise refuse(f"declares an XML section of {length} bytes, which runs past its end.")
+    return start, length
+
+
+def to_logical(physical: int) -> int:
+    """Return the offset among the payload bytes of an offset in the file."""
+    return physical // PAGE * PAYLOAD + physical % PAGE
+
+
+def to_physical(logical: int) -> int:
+    """Return the offset in the file of an offset among the payload bytes."""
+    return logical // PAYLOAD * PAGE + logical % PAYLOAD
+
+
+def _logical(data: UInt8, start: int, length: int) -> bytes:
+    """Return payload bytes, checksums left out."""
+    first, last = start // PAYLOAD, (start + length + PAYLOAD - 1) // PAYLOAD
+    payload = data[first * PAGE : last * PAGE].reshape(-1, PAGE)[:, :PAYLOAD].tobytes()
+    return payload[start - first * PAYLOAD :][:length]
+
+
+def _refuse_declarations(xml: bytes, path: Path) -> None:
+    """Let no document type or entity through, in whatever encoding it may hide."""
+    declared = re.match(rb"\s*<\?xml[^>]*?encoding\s*=\s*[\"']([^\"']*)[\"']", xml[:300])
+    encoding = declared.group(1).lower() if declared else b"utf-8"
+    text = xml.removeprefix(b"\xef\xbb\xbf")
+    if not text.startswith(b"<") or b"\0" in xml or encoding not in (b"utf-8", b"us-ascii"):
+        raise InputError(
+            f"has an XML section that is not UTF-8 (declared as {encoding.decode('latin-1')!r}).",
+            file=path,
+            place="XML section",
+            remedy=_AGAIN,
+        )
+    found = re.search(rb"<!\s*(DOCTYPE|ENTITY)", xml, re.IGNORECASE)
+    if found:
+        raise UnsafeReferenceError(
+            f"its XML section holds a {found.group(1).decode().upper()} declaration, by which a "
+            "file can read others on this machine.",
+            file=path,
+            place=f"byte {found.start()} of the XML section",
+            remedy="Ask where the file comes from; export it again from the scanner's software.",
+        )
+
+
+def _parse(xml: bytes, path: Path) -> _Walk:
+    walk = _Walk(xml, path)
+    try:
+        walk.parser.Parse(xml, True)
+    except expat.ExpatError as error:
+        raise InputError(
+            f"has an XML section that cannot be read: {error}.",
+            file=path,
+            place="XML section",
+            remedy=_AGAIN,
+        ) from error
+    except ValueError as error:
+        raise InputError(
+            f"has a value in its XML section that is no number: {error}.",
+            file=path,
+            place=f"line {walk.parser.CurrentLineNumber} of the XML section",
+            remedy=_AGAIN,
+        ) from error
+    return walk
+
+
+class _Walk:
+    """Goes through the XML once; keeps scans, poses and where in the bytes each pose lies."""
+
+    def __init__(self, xml: bytes, path: Path) -> None:
+        self.xml, self.path = xml, path
+        self.stack: list[str] = []
+        self.text = ""
+        self.entries: list[Entry] = []
+        self.crs: str | None = None
+        self.crs_span = (0, 0)
+        self.pose_start = -1
+        self.parser = expat.ParserCreate()
+        self.parser.buffer_text = True
+        self.parser.StartElementHandler = self.start
+        self.parser.EndElementHandler = self.end
+        self.parser.CharacterDataHandler = self.characters
+
+    def start(self, name: str, attributes: dict[str, str]) -> None:
+        self.stack.append(name)
+        self.text = ""
+        if len(self.stack) > MAX_DEPTH:
+            raise InputError(
+                f"nests its XML deeper than {MAX_DEPTH} elements.",
+                file=self.path,
+                place="XML section",
+                remedy=_AGAIN,
+            )
+        if self.stack == ["e57Root", "coordinateMetadata"]:
+            self.crs_span = (self.parser.CurrentByteIndex, 0)
+        elif len(self.stack) == 3 and name == "vectorChild":
+            self.entries.append(Entry(self.stack[1]))
+        elif len(self.stack) >= 4 and self.entries:
+            self._start_in_entry(name, attributes)
+
+    def _start_in_entry(self, name: str, attributes: dict[str, str]) -> None:
+        entry, inner = self.entries[-1], self.stack[3:]
+        if inner == ["pose"]:
+            self.pose_start = self.parser.CurrentByteIndex
+        elif inner == ["points"]:
+            entry.count = int(attributes.get("recordCount", "0"))
+        elif len(inner) == 3 and inner[:2] == ["points", "prototype"]:
+            entry.fields[name] = _field(name, attributes)
+
+    def _tag_end(self) -> int:
+        """Return where the end tag (or empty element) that is being reported ends."""
+        return self.xml.index(b">", self.parser.CurrentByteIndex) + 1
+
+    def characters(self, text: str) -> None:
+        self.text += text
+
+    def end(self, name: str) -> None:
+        inner, text = self.stack[3:], self.text.strip()
+        if self.stack == ["e57Root", "coordinateMetadata"]:
+            self.crs, self.crs_span = text or None, (self.crs_span[0], self._tag_end())
+        elif self.stack == ["e57Root"] and not self.crs_span[1]:  # a place for one
+            self.crs_span = (self.parser.CurrentByteIndex,) * 2
+        elif len(self.stack) == 3 and name == "vectorChild" and self.entries:
+            if self.pose_start < 0:  # a place for one: just before the end tag
+                self.entries[-1].pose = (self.parser.CurrentByteIndex,) * 2
+            self.pose_start = -1
+        elif inner and self.entries:
+            self._end_in_entry(inner, text)
+        self.stack.pop()
+        self.text = ""
+
+    def _end_in_entry(self, inner: list[str], text: str) -> None:
+        entry = self.entries[-1]
+        if inner == ["pose"]:
+            entry.pose = (self.pose_start, self._tag_end())
+            entry.rotation = _unit(entry.rotation, self.path)
+        elif len(inner) == 3 and inner[:2] == ["pose", "rotation"] and inner[2] in "wxyz":
+            entry.rotation["wxyz".index(inner[2])] = float(text or 0)
+        elif len(inner) == 3 and inner[:2] == ["pose", "translation"] and inner[2] in "xyz":
+            entry.translation["xyz".index(inner[2])] = float(text or 0)
+        elif len(inner) == 2 and inner[0] == "colorLimits":
+            entry.limits[inner[1]] = float(text or 0)
+
+
+def _unit(quaternion: Float64, path: Path) -> Float64:
+    norm = float(np.linalg.norm(quaternion))
+    if not (np.isfinite(norm) and norm > 1e-6):
+        raise InputError(
+            f"has a pose whose rotation is {quaternion.tolist()}, which is no rotation.",
+            file=path,
+            place="XML section",
+            remedy=_AGAIN,
+        )
+    return quaternion / norm
+
+
+def _field(name: str, attributes: dict[str, str]) -> Field:
+    """Read one element of a prototype (E2807 section 8.3; whole numbers are packed in bits)."""
+    low, high = attributes.get("minimum"), attributes.get("maximum")
+    if attributes.get("type") == "Float":
+        bits = 32 if attributes.get("precision") == "single" else 64
+        return Field(name, bits, float(low or "-inf"), float(high or "inf"))
+    first = -(2**63) if low is None else int(low)
+    last = 2**63 - 1 if high is None else int(high)
+    return Field(name, max(last - first, 0).bit_length(), first, last)
+
+
+def _check_count(scan: Entry, number: int, size: int, path: Path) -> None:
+    bits = max(sum(item.bits for item in scan.fields.values()), 1)
+    if scan.count < 0 or scan.count * bits > size * 8:
+        raise InputError(
+            f"declares {scan.count} points of {bits} bits each, but the file has {size} bytes.",
+            file=path,
+            place=f"scan {number + 1}",
+            remedy=_AGAIN,
+        )
+
+
+_CRC_TABLE = []
+for _byte in range(256):
+    for _ in range(8):
+        _byte = _byte >> 1 ^ (0x82F63B78 if _byte & 1 else 0)
+    _CRC_TABLE.append(_byte)
+
+
+def page_checksum(payload: bytes) -> bytes:
+    """Return the CRC-32C of a page's payload as E57 stores it (big-endian)."""
+    crc = 0xFFFFFFFF
+    for byte in payload:
+        crc = crc >> 8 ^ _CRC_TABLE[(crc ^ byte) & 0xFF]
+    return struct.pack(">I", crc ^ 0xFFFFFFFF)
+
+
+def paged(payload: bytes) -> bytes:
+    """Return payload bytes as whole pages with their checksums, the last one filled up."""
+    payload += b" " * (-len(payload) % PAYLOAD)
+    parts = (payload[at : at + PAYLOAD] for at in range(0, len(payload), PAYLOAD))
+    return b"".join(part + page_checksum(part) for part in parts)
+
+
+def with_poses(layout: Layout, poses: list[tuple[Float64, Float64]], crs: str | None) -> bytes:
+    """Return the XML with every pose and the CRS replaced, all other bytes kept.
+
+    Parameters
+    ----------
+    layout : Layout
+    poses : list of (rotation, translation)
+        Unit quaternion w, x, y, z and metres, one for each of `layout.entries`.
+    crs : str or None
+        The CRS that the new coordinates are in.
+    """
+    edits = [
+        (*entry.pose, _pose_text(*pose)) for entry, pose in zip(layout.entries, poses, strict=True)
+    ]
+    if crs != layout.crs:
+        text = f'<coordinateMetadata type="String"><![CDATA[{crs or ""}]]></coordinateMetadata>'
+        edits.append((*layout.crs_span, text.encode()))
+    xml = layout.xml
+    for start, stop, text_bytes in sorted(edits, reverse=True):
+        xml = xml[:start] + text_bytes + xml[stop:]
+    return xml
+
+
+def _pose_text(rotation: Float64, translation: Float64) -> bytes:
+    def values(names: str, numbers: Float64) -> str:
+        return "".join(
+            f'<{name} type="Float">{float(number)!r}</{name}>'
+            for name, number in zip(names, numbers, strict=True)
+        )
+
+    return (
+        '<pose type="Structure"><rotation type="Structure">'
+        + values("wxyz", rotation)
+        + '</rotation><translation type="Structure">'
+        + values("xyz", translation)
+        + "</translation></pose>"
+    ).encode("ascii")
+
+
+def header_page(first_page: bytes, size: int, xml_start: int, xml_length: int) -> bytes:
+    """Return the file's first page with new lengths (file, XML offset, XML length) and checksum."""
+    signature, major, minor, _, _, _, page = _HEADER.unpack(first_page[: _HEADER.size])
+    header = _HEADER.pack(signature, major, minor, size, xml_start, xml_length, page)
+    return paged(header + first_page[_HEADER.size : PAYLOAD])

@@ -1,0 +1,396 @@
+"""Where a file's coordinates are: file -> absolute metres -> another file, and back.
+
+``absolute = to_crs(axes @ file + shift)``: the signed axes carry the unit, the shift is added
+after them, and PROJ follows only where the file's CRS is not the metric one that absolute
+coordinates are in.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from meshreg.errors import InputError, MeshregError, UsageError
+from meshreg.io.bridge import bridge
+from meshreg.io.crs import (
+    check_area,
+    crs_name,
+    crs_text,
+    grid_scale_and_convergence,
+    metres_per_unit,
+    metric_crs,
+)
+from meshreg.io.mover import Mover, frame_matrix, make_mover, to_absolute, to_file
+from meshreg.io.options import ReadOptions
+from meshreg.io.sidecar import SidecarInfo, find_sidecar
+from meshreg.types import Float64, Frame, Maps, Mesh, PointCloud, SourceFile, Survey
+
+_LOG = logging.getLogger("meshreg")
+
+ENU = np.eye(3)
+NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+UNITS = {
+    "m": 1.0,
+    "dm": 0.1,
+    "cm": 0.01,
+    "mm": 0.001,
+    "km": 1000.0,
+    "ft": 0.3048,
+    "us-ft": 1200 / 3937,
+    "in": 0.0254,
+}
+_COLLAPSED = 0.02  # share of points fallen together from which 32-bit steps have spoilt a survey
+
+
+def frame_from(
+    options: ReadOptions,
+    sidecar: SidecarInfo | None = None,
+    file_crs: str | None = None,
+    default_axes: Any = None,
+    *,
+    centre: Any = None,
+) -> Frame:
+    """Join what the user, the sidecar and the file say into one `Frame`.
+
+    Parameters
+    ----------
+    options : ReadOptions
+        What the user says; it replaces what the sidecar says, item by item.
+    sidecar : SidecarInfo or None
+    file_crs : str or None
+        CRS found in the file itself, any spelling.
+    default_axes : (3, 3) array or None
+        Axes of the format where nobody says otherwise; `Y_UP` for glTF, else x east, y north, up.
+    centre : (3,) array or None
+        Centre of the file's coordinates, as stored. Needed wherever a CRS is known, to check its
+        area and to choose a UTM zone for degrees and feet; without it the CRS must be metric.
+
+    Returns
+    -------
+    Frame
+        `shift` is in metres, or in the CRS's own unit where that is feet or degrees.
+
+    Raises
+    ------
+    UsageError
+        Unknown axes or unit, or both `axes` and `up`.
+    InputError
+        Unknown CRS, two that disagree, or coordinates outside its area.
+    """
+    said = sidecar or SidecarInfo()
+    crs = _file_crs(options, said, file_crs)
+    axes = _axes(options, said, default_axes)
+    unit = options.unit if options.unit is not None else said.unit
+    if unit is not None:
+        axes = axes * (_unit(unit) / (metres_per_unit(crs) if crs else 1.0))
+    shift = np.array(options.shift if options.shift is not None else said.shift or (0, 0, 0), float)
+    if shift.shape != (3,) or not np.isfinite(shift).all():
+        raise UsageError(f"shift is {shift.tolist()}; it needs three finite numbers.")
+    if crs is None:
+        return Frame(axes, shift)
+    if centre is None:
+        raise UsageError("The centre of the coordinates is needed to place them in their CRS.")
+    place = axes @ np.asarray(centre, float) + shift
+    check_area(crs, *place)
+    return Frame(axes, shift, crs, metric_crs(crs, place))
+
+
+def _file_crs(options: ReadOptions, said: SidecarInfo, file_crs: str | None) -> str | None:
+    """Decide on the CRS: the user's, else our own sidecar's, else the file's or another sidecar's.
+
+    A .prj, coords.txt or SHIFT.txt that contradicts the file is refused: one of them is stale.
+    """
+    own = crs_text(file_crs) if file_crs else None
+    beside = crs_text(said.crs) if said.crs else None
+    if options.crs:
+        return crs_text(options.crs)
+    if own and beside and own != beside and not said.explicit_crs:
+        raise InputError(
+            f"the file says {crs_name(own)}, but {said.crs_path} says {crs_name(beside)}.",
+            remedy="Remove the wrong one, or say which by a .survey.toml.",
+        )
+    return beside or own
+
+
+def _axes(options: ReadOptions, said: SidecarInfo, default: Any) -> Float64:
+    axes: Any = said.axes
+    up: Any = said.up
+    if options.axes is not None or options.up is not None:
+        axes, up = options.axes, options.up
+    if axes is not None and not isinstance(axes, str):
+        return np.array(axes, float)
+    if axes == "ned" and up == "y":
+        raise UsageError('axes="ned" and up="y" contradict each other.', remedy="Give one.")
+    if axes not in (None, "enu", "ned") or up not in (None, "y", "z"):
+        raise UsageError(f'axes is {axes!r} and up {up!r}; use "enu" or "ned", "y" or "z".')
+    if axes == "ned":
+        return NED.copy()
+    if up == "y":
+        return Y_UP.copy()
+    if axes is None and up is None and default is not None:
+        return np.array(default, float)
+    return ENU.copy()
+
+
+def _unit(unit: str | float) -> float:
+    """Return the length of a unit [m]; a number is taken as metres itself."""
+    length = UNITS.get(unit.strip().lower()) if isinstance(unit, str) else float(unit)
+    if length is None or not (np.isfinite(length) and length > 0):
+        raise UsageError(f"unit {unit!r} is not known.", remedy=f"Use one of {', '.join(UNITS)}.")
+    return length
+
+
+@dataclass(frozen=True, eq=False)
+class Placed:
+    """A file's points in place: `points` (N, 3) float64 [m] from the absolute `origin` (3,).
+
+    `frame` belongs in the `SourceFile`, `notes` in the `Survey`; `name` and `date` come from a
+    `.survey.toml`, where there is one; `sidecar` is the file that gave the shift or the CRS.
+    """
+
+    points: Float64
+    origin: Float64
+    frame: Frame
+    notes: tuple[str, ...] = ()
+    sidecar: Path | None = None
+    name: str | None = None
+    date: str | None = None
+
+
+def place(
+    path: Path,
+    xyz: Any,
+    options: ReadOptions,
+    file_crs: str | None = None,
+    default_axes: Any = None,
+    *,
+    georeferenced: bool = False,
+    bounds: Any = None,
+) -> Placed:
+    """Do what every reader does with its points: find the sidecar, the frame and a local origin.
+
+    Parameters
+    ----------
+    path : Path
+        The file, for its sidecars and for messages.
+    xyz : (N, 3) array
+        Finite coordinates as stored, N >= 1.
+    options, file_crs, default_axes
+        As for `frame_from`.
+    georeferenced : bool
+        The format states absolute coordinates itself (LAS, GeoTIFF): a shift file that speaks for
+        a whole folder (offset.xyz, coords.txt, SHIFT.txt) is not meant for it.
+    bounds : (2, 3) array, optional
+        Lowest and highest of the coordinates that are in use, where not of all `xyz`.
+
+    Raises
+    ------
+    InputError
+        No points, coordinates outside their CRS, or spoilt by 32-bit numbers.
+    """
+    xyz = np.asarray(xyz)
+    if not len(xyz):
+        raise InputError("holds no points.", file=path, remedy="Export it again.")
+    ends = np.asarray(bounds if bounds is not None else [xyz.min(axis=0), xyz.max(axis=0)], float)
+    if not np.isfinite(ends).all():
+        raise InputError(f"has coordinates {ends.tolist()} that are not finite.", file=path)
+    notes = _single_precision_note(path, xyz, ends)
+    sidecar = find_sidecar(path, shared=not georeferenced)
+    centre = ends[0] / 2 + ends[1] / 2
+    try:
+        frame = frame_from(options, sidecar, file_crs, default_axes, centre=centre)
+        corners = np.stack(np.meshgrid(*ends.T, indexing="ij"), axis=-1).reshape(-1, 3)
+        origin = np.round(to_absolute(frame, corners).mean(axis=0))
+        points = _from_origin(frame, xyz, origin)
+        notes += _frame_notes(options, sidecar, frame, centre)
+    except MeshregError as error:
+        error.file = error.file or str(path)
+        raise
+    for note in notes:
+        _LOG.warning("%s: %s", path.name, note)
+    said = sidecar or SidecarInfo()
+    return Placed(points, origin, frame, notes, said.path, said.name, said.date)
+
+
+def _from_origin(frame: Frame, xyz: Any, origin: Float64) -> Float64:
+    """Return absolute coordinates minus `origin`, without going through large numbers if linear."""
+    if frame.is_linear:
+        # One matrix product: exact for signed permutations, and no second copy.
+        points = np.asarray(xyz, np.float64) @ frame.axes.T
+        points += frame.shift - origin
+        return points
+    points = to_absolute(frame, xyz)
+    points -= origin
+    return points
+
+
+def _frame_notes(
+    options: ReadOptions, sidecar: SidecarInfo | None, frame: Frame, centre: Float64
+) -> tuple[str, ...]:
+    notes: list[str] = []
+    if sidecar is not None:
+        notes += sidecar.notes
+        if sidecar.shift is not None and options.shift is None:
+            text = ", ".join(f"{value:.12g}" for value in sidecar.shift)
+            notes.append(f"The shift ({text}) from {sidecar.shift_name} is added.")
+        elif sidecar.shift is not None:
+            notes.append(f"The stated shift replaces the one in {sidecar.shift_name}.")
+    if frame.file_crs != frame.crs and frame.file_crs and frame.crs:
+        how = bridge(frame.file_crs, frame.crs).note(frame.axes @ centre + frame.shift)
+        notes.append(
+            f"Coordinates were taken from {crs_name(frame.file_crs)} to {crs_name(frame.crs)}"
+            + (f" ({how})." if how else ".")
+        )
+    return tuple(notes)
+
+
+def _single_precision_note(path: Path, xyz: Any, ends: Float64) -> tuple[str, ...]:
+    """Find coordinates that went through 32-bit numbers at large values; refuse collapsed ones.
+
+    Float32 steps by 0.5 m at a UTM northing. A file is refused when its points fell together on
+    such steps; regular grids, which happen to be representable, keep their points apart.
+    """
+    step = float(np.spacing(np.abs(ends[:, :2]).max().astype(np.float32)))
+    if step < 1e-3:
+        return ()
+    sample = np.asarray(xyz[:: max(1, len(xyz) // 200_000), :2], float)
+    with np.errstate(over="ignore"):
+        if not (sample.astype(np.float32) == sample).all():
+            return ()
+    share = 1 - len(np.unique(sample, axis=0)) / len(sample)
+    if share > _COLLAPSED and len(sample) > 100:
+        raise InputError(
+            f"has lost its coordinates to 32-bit numbers: they step by {step:.3g} m, and "
+            f"{share:.0%} of the points coincide with another.",
+            file=path,
+            remedy="Export it in local coordinates with a shift, or with 64-bit numbers.",
+        )
+    return (f"Coordinates are 32-bit numbers that step by {step:.3g} m.",)
+
+
+def reframe(survey: Survey, crs: str) -> Survey:
+    """Take a survey to another CRS; its own must be known.
+
+    Raises
+    ------
+    UsageError
+        The survey has no CRS.
+    InputError
+        No operation between the two, or points outside the new CRS's area.
+    """
+    if survey.crs is None:
+        raise UsageError(f"Survey {survey.name!r} has no CRS; it cannot be taken to {crs}.")
+    crs = crs_text(crs) or crs
+    if crs == survey.crs:
+        return survey
+    way = bridge(survey.crs, crs)
+    how = way.note(survey.centre)
+    note = f"Points were taken from {crs_name(survey.crs)} to {crs_name(crs)}"
+    note += f" ({how})." if how else "."
+    source = tuple(replace(item, frame=replace(item.frame, crs=crs)) for item in survey.source)
+    geometry = survey.geometry
+    changes: dict[str, Any] = {"crs": crs, "source": source, "notes": (*survey.notes, note)}
+    if isinstance(geometry, Maps):
+        from meshreg.io.maps import reproject
+
+        return replace(survey, geometry=reproject(geometry, crs), **changes)
+    points = way.forward(geometry.points + survey.origin)
+    if not np.isfinite(points).all():
+        raise InputError(f"points of {survey.name!r} lie outside the area of {crs_name(crs)}.")
+    origin = np.round((points.min(axis=0) + points.max(axis=0)) / 2)
+    points -= origin
+    moved: Mesh | PointCloud
+    if isinstance(geometry, Mesh):
+        moved = replace(geometry, vertices=points)
+    else:
+        moved = replace(geometry, points=points)
+    return replace(survey, geometry=moved, origin=origin, **changes)
+
+
+def common_crs(reference: Survey, moving: Survey) -> tuple[Survey, tuple[str, ...]]:
+    """Bring the moving survey to the reference's CRS, and say what that means.
+
+    Returns
+    -------
+    moving : Survey
+        Reframed where both CRS are known and differ; else as it came. Where one is missing, the
+        numbers of both are taken as one local frame.
+    notes : tuple of str
+    """
+    if reference.crs == moving.crs:
+        return moving, ()
+    if reference.crs is not None and moving.crs is not None:
+        moved = reframe(moving, reference.crs)
+        return moved, moved.notes[len(moving.notes) :]
+    known, other = (reference, moving) if moving.crs is None else (moving, reference)
+    note = (
+        f"{known.name!r} is in {crs_name(known.crs)}, {other.name!r} in a local frame without "
+        "CRS: their coordinates are taken as one local frame. "
+    )
+    return moving, (note + _grid_note(known),)
+
+
+def _grid_note(survey: Survey) -> str:
+    assert survey.crs is not None
+    east, north = survey.centre[:2]
+    scale, convergence = grid_scale_and_convergence(survey.crs, east, north)
+    return (
+        f"There the grid's scale is {scale:.6f} ({(scale - 1) * 1e3:+.2f} mm per metre) and grid "
+        f"north lies {np.degrees(convergence):+.3f} degrees clockwise of true north; a local frame "
+        "in true metres differs by that."
+    )
+
+
+def registered_frame(reference: SourceFile, moving: SourceFile, *, centre: Any = None) -> Frame:
+    """Return the frame that the registered moving file is written in: the reference file's.
+
+    glTF keeps its own axes (the format says Y up), in metres, with the reference's shift. A
+    format of 32-bit numbers gets a round shift of its own at `centre` where the reference's would
+    leave numbers that step by more than 0.1 mm.
+
+    Parameters
+    ----------
+    reference, moving : SourceFile
+        First file of each survey.
+    centre : (3,) array, optional
+        Absolute centre of the registered survey [m].
+    """
+    frame = reference.frame
+    own_axes = moving.format in ("glb", "gltf")
+    if own_axes:
+        unit = float(np.cbrt(abs(np.linalg.det(moving.frame.axes))))
+        metric = frame.crs is None or frame.file_crs == frame.crs
+        shift = frame.shift if metric else np.zeros(3)
+        frame = Frame(moving.frame.axes / unit, shift, frame.crs, frame.crs)
+    if centre is None or not (own_axes or moving.counts.get("single_precision")):
+        return frame
+    local = to_file(frame, np.atleast_2d(centre))
+    if float(np.spacing(np.abs(local).max().astype(np.float32))) <= 1e-4:
+        return frame
+    return Frame(frame.axes, np.round(np.asarray(centre, float)), frame.crs, frame.crs)
+
+
+__all__ = [
+    "ENU",
+    "NED",
+    "UNITS",
+    "Y_UP",
+    "Mover",
+    "Placed",
+    "common_crs",
+    "frame_from",
+    "frame_matrix",
+    "grid_scale_and_convergence",
+    "make_mover",
+    "metric_crs",
+    "place",
+    "reframe",
+    "registered_frame",
+    "to_absolute",
+    "to_file",
+]

@@ -1,0 +1,199 @@
+"""Loops over polygons: ear clipping, and keys by which faces are compared."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from meshreg.jit import jit
+
+
+@jit(nogil=True)
+def _turn(a: Any, b: Any, c: Any) -> float:
+    """Twice the signed area of the triangle a, b, c in the plane; positive to the left."""
+    return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
+
+
+@jit(nogil=True)
+def _flatten(points: Any, vertex: Any, first: int, size: int) -> Any:
+    """Project a polygon along its normal's largest axis; return (size, 2) anticlockwise, bend.
+
+    The normal is Newell's; bend is the largest distance from the mean plane over the size.
+    """
+    normal = np.zeros(3)
+    mean = np.zeros(3)
+    for k in range(size):
+        p = points[vertex[first + k]]
+        q = points[vertex[first + (k + 1) % size]]
+        mean += p / size
+        # Differences from the first corner keep the digits at UTM size.
+        o = points[vertex[first]]
+        for axis in range(3):
+            i, j = (axis + 1) % 3, (axis + 2) % 3
+            normal[axis] += (p[i] - o[i]) * (q[j] - o[j]) - (p[j] - o[j]) * (q[i] - o[i])
+    axis = np.argmax(np.abs(normal))
+    i, j = (axis + 1) % 3, (axis + 2) % 3
+    if normal[axis] < 0:
+        i, j = j, i
+    flat = np.empty((size, 2))
+    length = np.sqrt((normal * normal).sum())
+    far = 0.0
+    extent = 0.0
+    for k in range(size):
+        p = points[vertex[first + k]] - mean
+        flat[k, 0], flat[k, 1] = p[i], p[j]
+        if length > 0:
+            far = max(far, abs((p * normal).sum()) / length)
+        extent = max(extent, np.sqrt((p * p).sum()))
+    return flat, (far / extent if extent > 0 else 0.0)
+
+
+@jit(nogil=True)
+def _is_convex(flat: Any) -> bool:
+    size = len(flat)
+    for k in range(size):
+        if _turn(flat[k - 1], flat[k], flat[(k + 1) % size]) < 0:
+            return False
+    # Left turns only, but more than once around: a star is not convex.
+    for k in range(1, size - 1):
+        if _turn(flat[0], flat[k], flat[k + 1]) < 0:
+            return False
+    return True
+
+
+@jit(nogil=True)
+def _is_ear(flat: Any, left: Any, size: int, k: int) -> bool:
+    """Whether corner k of the corners still `left` can be cut off."""
+    before, here, after = left[(k - 1) % size], left[k], left[(k + 1) % size]
+    a, b, c = flat[before], flat[here], flat[after]
+    if _turn(a, b, c) <= 0:
+        return False
+    for n in range(size):
+        other = left[n]
+        if other in (before, here, after):
+            continue
+        p = flat[other]
+        inside = _turn(a, b, p) >= 0 and _turn(b, c, p) >= 0 and _turn(c, a, p) >= 0
+        same = (
+            (p[0] == a[0] and p[1] == a[1])
+            or (p[0] == b[0] and p[1] == b[1])
+            or (p[0] == c[0] and p[1] == c[1])
+        )
+        if inside and not same:
+            return False
+    return True
+
+
+@jit(nogil=True)
+def _clip_ears(flat: Any, first: int, corners: Any, place: int) -> None:
+    """Write the len(flat) - 2 triangles of one simple polygon into `corners` from `place` on."""
+    size = len(flat)
+    left = np.arange(size)
+    k = 0
+    idle = 0
+    while size > 3:
+        # A polygon that crosses itself has no ear in the end: cut anyway, so that this ends.
+        if _is_ear(flat, left, size, k % size) or idle > size:
+            k %= size
+            corners[place, 0] = first + left[(k - 1) % size]
+            corners[place, 1] = first + left[k]
+            corners[place, 2] = first + left[(k + 1) % size]
+            place += 1
+            for n in range(k, size - 1):
+                left[n] = left[n + 1]
+            size -= 1
+            idle = 0
+            k = max(k - 1, 0)
+        else:
+            k += 1
+            idle += 1
+    for n in range(3):
+        corners[place, n] = first + left[n]
+
+
+@jit(nogil=True)
+def cut_concave(
+    points: Any, vertex: Any, polygons: Any, corners: Any, bent: float, largest: int
+) -> tuple[int, int, int]:
+    """Replace the fans of concave polygons in `corners` by ears.
+
+    Parameters
+    ----------
+    points : (V, 3) float64
+    vertex : (C,) int64
+    polygons : (P, 3) int64
+        First corner, size and first row in `corners` of each.
+    corners : (F, 3) int64
+        Changed in place.
+    bent : float
+        Above this bend a concave polygon is counted as not flat.
+    largest : int
+        Concave polygons of more corners stop the work.
+
+    Returns
+    -------
+    concave, bent : int
+        How many.
+    large : int
+        Row of `polygons` that is too large, or -1.
+    """
+    n_concave, n_bent = 0, 0
+    for row in range(len(polygons)):
+        first, size, place = polygons[row]
+        flat, bend = _flatten(points, vertex, first, size)
+        if _is_convex(flat):
+            continue
+        if size > largest:
+            return n_concave, n_bent, row
+        n_concave += 1
+        if bend > bent:
+            n_bent += 1
+        _clip_ears(flat, first, corners, place)
+    return n_concave, n_bent, -1
+
+
+@jit(nogil=True)
+def face_keys(points: Any, faces: Any) -> Any:
+    """Give each face a key equal for equal vertex sets, and say which are flat or not finite.
+
+    Returns
+    -------
+    key : (F,) uint64
+        Exact up to 2^21 vertices, a hash above.
+    flat : (F,) bool
+        No area: a repeated vertex, or three corners in line.
+    lost : (F,) bool
+        A corner is NaN or infinite.
+    """
+    n_faces = len(faces)
+    key = np.empty(n_faces, np.uint64)
+    flat = np.zeros(n_faces, np.bool_)
+    lost = np.zeros(n_faces, np.bool_)
+    exact = len(points) <= 2097152
+    spread = np.uint64(0x9E3779B97F4A7C15)
+    for row in range(n_faces):
+        a, b, c = faces[row, 0], faces[row, 1], faces[row, 2]
+        low, high = min(a, b, c), max(a, b, c)
+        middle = a + b + c - low - high
+        if exact:
+            packed = np.uint64(low) << np.uint64(42)
+            key[row] = packed | (np.uint64(middle) << np.uint64(21)) | np.uint64(high)
+        else:
+            h = np.uint64(low) * spread
+            h = (h ^ (h >> np.uint64(29)) ^ np.uint64(middle)) * spread
+            h = (h ^ (h >> np.uint64(32)) ^ np.uint64(high)) * spread
+            key[row] = h ^ (h >> np.uint64(29))
+        total = 0.0
+        area = 0.0
+        for i in range(3):
+            j, k = (i + 1) % 3, (i + 2) % 3
+            total += points[a, i] + points[b, i] + points[c, i]
+            part = (points[b, j] - points[a, j]) * (points[c, k] - points[a, k])
+            part -= (points[b, k] - points[a, k]) * (points[c, j] - points[a, j])
+            area += part * part
+        if not np.isfinite(total):
+            lost[row] = True
+        elif low == middle or middle == high or area == 0.0:
+            flat[row] = True
+    return key, flat, lost

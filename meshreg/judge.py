@@ -1,0 +1,353 @@
+"""JUDGE: score all candidates by one neutral measure, fuse those that agree, give the verdict.
+
+The methods propose; two independent channels, terrain and image, dispose (`offsets.neutral`).
+A wrong registration marked accepted is the worst that can happen here, so a candidate is accepted
+only when both channels put it first by more than chance could, or one does so overwhelmingly and
+the other does not contradict. Chance is measured on the pair itself.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from meshreg.offsets import neutral
+from meshreg.offsets.correlate import Window
+from meshreg.offsets.surface import Peak, find_peak, gap_at
+from meshreg.settings import JudgeSettings, Settings
+from meshreg.types import Float64, OffsetEstimate, SurveyRaster, Verdict
+
+TURNS = tuple((turn, flip) for turn in range(4) for flip in (False, True))[1:]
+TURN_NAMES = {
+    (0, True): "mirrored east-west",
+    (2, True): "mirrored north-south",
+    (1, False): "turned by 90°",
+    (2, False): "turned by 180°",
+    (3, False): "turned by 270°",
+    (1, True): "with east and north exchanged",
+    (3, True): "with east and north exchanged and reversed",
+}
+
+
+@dataclass(frozen=True)
+class ChannelMap:
+    """One channel's evidence for every offset, and what chance does to it.
+
+    Attributes
+    ----------
+    name : "terrain" or "image"
+    window : Window
+    surface : (K, L) float64
+        Evidence in deviations of chance (`neutral.surface`).
+    counts : (K, L) float64
+        Cells in the overlap.
+    peak : Peak or None
+    null_gap : float
+        Mean gap of the mirrored and turned maps; the scale on which gaps are exponential.
+    turned : mapping
+        Gap of each mirrored or turned map, by its name.
+    """
+
+    name: neutral.Channel
+    window: Window
+    surface: Float64
+    counts: Float64
+    peak: Peak | None
+    null_gap: float
+    turned: Mapping[str, float]
+
+    def false_alarm(self, gap: float) -> float:
+        """Chance that a wrong peak stands out by `gap`: exponential in units of the null gap."""
+        return math.exp(-max(gap, 0.0) / self.null_gap)
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """A candidate offset with the neutral scores that it got in each channel.
+
+    `gaps` and `values` are by channel; `methods` names who proposed it.
+    """
+
+    east: float
+    north: float
+    sigma: Float64
+    gaps: Mapping[str, float]
+    values: Mapping[str, float]
+    methods: tuple[str, ...]
+    overlap: float
+
+    @property
+    def score(self) -> float:
+        """Sum of the channels' evidence over sqrt(channels): the order of the hypotheses."""
+        finite = [v for v in self.values.values() if math.isfinite(v)]
+        return sum(finite) / math.sqrt(len(finite)) if finite else -math.inf
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """The verdict before refinement."""
+
+    verdict: Verdict
+    reason: str
+    best: Hypothesis | None
+    hypotheses: tuple[Hypothesis, ...] = ()
+    false_alarm: float = 1.0
+    maps: Mapping[str, ChannelMap] = field(default_factory=dict)
+
+
+def judge(
+    estimates: Sequence[OffsetEstimate],
+    rasters: Mapping[str, tuple[SurveyRaster, SurveyRaster]],
+    settings: Settings,
+    radius: float,
+) -> Judgement:
+    """Weigh the methods' candidates against the evidence of terrain and image.
+
+    Parameters
+    ----------
+    estimates : sequence of OffsetEstimate
+    rasters : mapping
+        "dem" and "ortho" to (reference, moving).
+    settings : Settings
+    radius : float
+        Half width of the search window [m].
+    """
+    maps: dict[str, ChannelMap] = {}
+    for channel, raster in (("terrain", "dem"), ("image", "ortho")):
+        found = channel_map(*rasters[raster], channel, radius, settings.search.min_overlap)  # type: ignore[arg-type]
+        if found is not None:
+            maps[channel] = found
+    if not maps:
+        return Judgement("rejected", "the surveys do not overlap within the search window", None)
+    reach = agree_distance(settings.judge, rasters["dem"][0].grid.cell)
+    candidates = _candidates(estimates, maps)
+    hypotheses = tuple(
+        sorted(_merge(candidates, maps, reach), key=lambda h: h.score, reverse=True)
+    )
+    if not hypotheses:
+        return Judgement("rejected", "no method found a candidate", None, maps=maps)
+    return _verdict(hypotheses, maps, settings.judge, radius, reach)
+
+
+def agree_distance(settings: JudgeSettings, dem_cell: float) -> float:
+    """Candidates nearer than this are one: 0.25 m, or 2.5 DEM cells where those are coarser."""
+    return max(settings.agree_distance, 2.5 * dem_cell)
+
+
+def channel_map(
+    reference: SurveyRaster,
+    moving: SurveyRaster,
+    channel: neutral.Channel,
+    radius: float,
+    min_overlap: float,
+) -> ChannelMap | None:
+    """Compute a channel's evidence and its null; None where there is nothing to compare."""
+    valid = (
+        (reference.valid, moving.valid)
+        if channel == "terrain"
+        else (reference.color_valid, moving.color_valid)
+    )
+    if min(int(mask.sum()) for mask in valid) < 100:
+        return None
+    window = Window.around(reference.grid, moving.grid, radius)
+    first, second = neutral.fields(reference, channel), neutral.fields(moving, channel)
+    surface, counts = neutral.surface(first, second, window, min_overlap)
+    exclusion = max(0.5, 5 * window.cell)
+    peak = find_peak(surface, window.east, window.north, exclusion)
+    if peak is None:
+        return None
+    turned: dict[str, float] = {}
+    for turn, flip in TURNS:
+        grid = neutral.turned_grid(moving.grid, turn)
+        null_window = Window.around(reference.grid, grid, radius)
+        fields = [neutral.mirrored(f, turn, flip) for f in second]
+        null, _ = neutral.surface(first, fields, null_window, min_overlap)
+        null_peak = find_peak(null, null_window.east, null_window.north, exclusion)
+        if null_peak is not None:
+            turned[TURN_NAMES[turn, flip]] = null_peak.gap
+    # the theory of extremes gives 1/sqrt(2 ln M) for M independent offsets: about 0.3. A map
+    # that matches by chance of symmetry (or because the survey IS mirrored) must not widen the
+    # scale for the rest, hence the median; ln 2 turns an exponential's median into its mean.
+    gaps = list(turned.values())
+    null_gap = max(float(np.median(gaps)) / math.log(2) if gaps else 0.0, 0.3)
+    return ChannelMap(channel, window, surface, counts, peak, null_gap, turned)
+
+
+def _candidates(
+    estimates: Sequence[OffsetEstimate], maps: Mapping[str, ChannelMap]
+) -> list[tuple[float, float, Float64 | None, str]]:
+    """Every method's answer and each channel's own first and second peak."""
+    found: list[tuple[float, float, Float64 | None, str]] = [
+        (e.east, e.north, e.sigma, e.method) for e in estimates if e.status != "failed"
+    ]
+    for name, channel in maps.items():
+        assert channel.peak is not None
+        found.append((channel.peak.east, channel.peak.north, channel.peak.sigma, f"{name} channel"))
+        if channel.peak.second is not None:
+            found.append((*channel.peak.second, None, f"{name} channel's second"))
+    return found
+
+
+def _merge(
+    candidates: list[tuple[float, float, Float64 | None, str]],
+    maps: Mapping[str, ChannelMap],
+    reach: float,
+) -> list[Hypothesis]:
+    """Score each candidate, then let those within `reach` of a better one join it."""
+    scored = []
+    for east, north, _, method in candidates:
+        gaps, values, places = {}, {}, []
+        for name, channel in maps.items():
+            window = channel.window
+            gaps[name], values[name], place = gap_at(
+                channel.surface, window.east, window.north, (east, north), reach
+            )
+            places.append(place)
+        overlap = max(_overlap_at(channel, (east, north)) for channel in maps.values())
+        scored.append(
+            Hypothesis(east, north, np.eye(2), gaps, values, (method,), overlap)
+        )
+    scored.sort(key=lambda h: h.score, reverse=True)
+    groups: list[list[Hypothesis]] = []
+    for hypothesis in scored:
+        for group in groups:
+            lead = group[0]
+            if math.hypot(lead.east - hypothesis.east, lead.north - hypothesis.north) <= reach:
+                group.append(hypothesis)
+                break
+        else:
+            groups.append([hypothesis])
+    answers = {(east, north): sigma for east, north, sigma, _ in candidates}
+    return [_fused(group, maps, answers) for group in groups]
+
+
+def _fused(
+    group: list[Hypothesis],
+    maps: Mapping[str, ChannelMap],
+    answers: Mapping[tuple[float, float], Float64 | None],
+) -> Hypothesis:
+    """Join the members of a group by their inverse covariances.
+
+    A member further from the group's leading one than three of its own sigmas is named as a
+    supporter but does not pull the mean. The sum of weights is not trusted as a covariance:
+    the members look at the same ground, so the best single one's covariance is kept.
+    """
+    weights, total, best = np.zeros((2, 2)), np.zeros(2), None
+    for member in group:
+        sigma = answers[member.east, member.north]
+        if sigma is None:
+            continue
+        place = np.array([member.east, member.north])
+        step = place - (group[0].east, group[0].north)
+        if step @ np.linalg.solve(sigma + np.eye(2) * 0.02**2, step) > 3**2:
+            continue
+        weight = np.linalg.inv(sigma)
+        weights, total = weights + weight, total + weight @ place
+        best = sigma if best is None or np.trace(sigma) < np.trace(best) else best
+    lead = group[0]
+    place = np.linalg.solve(weights, total) if best is not None else (lead.east, lead.north)
+    if best is None:
+        cell = max(channel.window.cell for channel in maps.values())
+        best = cell**2 * np.eye(2)
+    methods = tuple(dict.fromkeys(m for member in group for m in member.methods))
+    return Hypothesis(
+        float(place[0]), float(place[1]), best, lead.gaps, lead.values, methods, lead.overlap
+    )
+
+
+def _overlap_at(channel: ChannelMap, at: tuple[float, float]) -> float:
+    """Overlap at an offset as a share of the largest in the window."""
+    col = int(np.argmin(np.abs(channel.window.east - at[0])))
+    row = int(np.argmin(np.abs(channel.window.north - at[1])))
+    return float(channel.counts[row, col] / max(float(channel.counts.max()), 1.0))
+
+
+def _verdict(
+    hypotheses: tuple[Hypothesis, ...],
+    maps: Mapping[str, ChannelMap],
+    settings: JudgeSettings,
+    radius: float,
+    reach: float,
+) -> Judgement:
+    best = hypotheses[0]
+    alarm = _false_alarm(best, maps, radius, reach)
+
+    def say(verdict: Verdict, reason: str) -> Judgement:
+        return Judgement(verdict, reason, best, hypotheses, alarm, maps)
+
+    support = {name: gap for name, gap in best.gaps.items() if gap >= settings.support_gap}
+    leader = max(best.gaps, key=lambda name: best.gaps[name])
+    contradicting = {
+        name: channel.peak.gap
+        for name, channel in maps.items()
+        if best.gaps[name] < 0
+        and channel.peak is not None
+        and channel.false_alarm(channel.peak.gap) < settings.max_false_alarm
+    }
+    turned = _turned(maps, settings)
+    words = ", ".join(f"{name} gap {gap:.1f}" for name, gap in best.gaps.items())
+    if turned and max(best.gaps.values()) < settings.accept_gap:
+        return say("rejected", f"the moving survey fits only when {turned}: check its axes")
+    if contradicting:
+        where = " and ".join(contradicting)
+        return say("review", f"the channels contradict each other: {where} fits elsewhere ({words})")
+    if alarm > settings.max_false_alarm and max(best.gaps.values()) < settings.support_gap:
+        return say(
+            "rejected",
+            f"no offset within ±{radius:g} m stands out from chance ({words}); "
+            "another place, too much change, or beyond the search radius",
+        )
+    if best.overlap < settings.min_overlap:
+        return say("review", f"the surveys overlap by only {best.overlap:.0%} of what they could")
+    edge = radius - max(abs(best.east), abs(best.north))
+    if edge < 2 * max(channel.window.cell for channel in maps.values()):
+        return say("review", "the best offset is at the search border; try a larger --search-radius")
+    if turned:
+        return say("review", f"the moving survey fits just as well when {turned}")
+    if alarm > settings.max_false_alarm:
+        return say("review", f"chance could do as well once in {1 / alarm:.3g} ({words})")
+    if len(support) >= 2 and max(support.values()) >= settings.accept_gap / 2:
+        return say("accepted", f"terrain and image agree ({words})")
+    if best.gaps[leader] >= settings.overwhelming_gap:
+        others = [name for name in best.gaps if name != leader]
+        silent = f"; {others[0]} is silent" if others else f"; there is no {_missing(maps)}"
+        return say("accepted", f"{leader} is overwhelming ({words}){silent}")
+    return say("review", f"only {leader} stands out, and not overwhelmingly ({words})")
+
+
+def _false_alarm(
+    best: Hypothesis, maps: Mapping[str, ChannelMap], radius: float, reach: float
+) -> float:
+    """Chance that unrelated ground makes a candidate this good.
+
+    Each channel's gap has an exponential tail; where both put the same place first, two
+    unrelated maps would do that only as often as the agreement disc fills the window.
+    """
+    alarm, first = 1.0, True
+    for name, channel in maps.items():
+        gap = best.gaps[name]
+        if gap <= 0:
+            continue
+        alarm *= channel.false_alarm(gap)
+        if not first:
+            alarm *= min(1.0, math.pi * reach**2 / (2 * radius) ** 2)
+        first = False
+    return alarm
+
+
+def _turned(maps: Mapping[str, ChannelMap], settings: JudgeSettings) -> str:
+    """Name of a mirrored or turned map that fits far better than chance, or ''."""
+    worst, name = 0.0, ""
+    for channel in maps.values():
+        for turn, gap in channel.turned.items():
+            if gap >= settings.accept_gap and gap > worst:
+                worst, name = gap, turn
+    return name
+
+
+def _missing(maps: Mapping[str, Any]) -> str:
+    return "color" if "image" not in maps else "relief"

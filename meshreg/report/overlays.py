@@ -1,0 +1,141 @@
+"""Figures of both surveys laid on each other: relief, cross section, orthomosaics."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from meshreg.report import style
+from meshreg.types import Registration, SurveyRaster
+
+
+def draw_relief(registration: Registration) -> Any:
+    """Relief of both surveys on each other, before and after (blue reference, red moving)."""
+    evidence = registration.evidence
+    stages = _stages(registration, "moving_dem")
+    if "reference_dem" not in evidence or not stages:
+        return None
+    height, grid = style.reduced_height(evidence["reference_dem"])
+    shaded = style.hillshade(height, grid.cell)
+    tall = style.panel_size(grid, 4.6)
+    figure = style.new_figure(
+        4.9 * len(stages) + 0.5,
+        tall + 1.4,
+        "Relief of both surveys, lit from the north-west",
+        "grey: both agree    blue: reference alone    red: moving alone    pale: seen by one only",
+    )
+    place = style.Place(grid)
+    for index, (name, moving) in enumerate(stages):
+        axes = figure.add_subplot(1, len(stages), index + 1)
+        moved, _ = style.reduced_height(moving)
+        overlay = style.two_tone(shaded, style.hillshade(moved, grid.cell))
+        axes.imshow(overlay, extent=place.extent(grid), interpolation="nearest")
+        axes.set_title(name, fontsize=10)
+        place.label(axes, inner=index > 0)
+    return figure
+
+
+def draw_section(registration: Registration) -> Any:
+    """Heights of both surveys along a line from south to north through the overlap."""
+    evidence = registration.evidence
+    stages = _stages(registration, "moving_dem")
+    if "reference_dem" not in evidence or not stages:
+        return None
+    reference: SurveyRaster = evidence["reference_dem"]
+    column = _busiest_column(reference, stages[-1][1])
+    if column is None:
+        return None
+    grid = reference.grid
+    place = style.Place(grid)
+    east, north = grid.east_north(np.arange(grid.shape[0]), column)
+    figure = style.new_figure(
+        9.5,
+        4.2,
+        f"Cross section at east {float(np.atleast_1d(east)[0]):.2f} m",
+        "south to the left; heights as they are, not exaggerated in the numbers",
+    )
+    axes = figure.add_subplot()
+    _profile(axes, north - place.north, reference, column, color=style.REFERENCE, label="reference")
+    looks: dict[str, dict[str, Any]] = {
+        "before": {"color": "#999999", "linestyle": "--", "linewidth": 1.0},
+        "after": {"color": style.MOVING, "linewidth": 1.3},
+    }
+    for name, moving in stages:
+        label = f"moving, {name}"
+        _profile(axes, north - place.north, moving, column, label=label, **looks[name])
+    axes.set_xlabel(style._axis("north", place.north))
+    axes.set_ylabel("height [m]")
+    axes.grid(alpha=0.25)
+    axes.ticklabel_format(useOffset=False, style="plain")
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, 1.11), ncols=3, frameon=False, fontsize=9)
+    return figure
+
+
+def draw_orthos(registration: Registration) -> Any:
+    """Orthomosaics on each other before and after, and as a chequerboard."""
+    evidence = registration.evidence
+    stages = _stages(registration, "moving_ortho")
+    reference: SurveyRaster | None = evidence.get("reference_ortho")
+    if reference is None or not stages or not reference.color_valid.any():
+        return None
+    if not stages[-1][1].color_valid.any():
+        return None
+    color, grid = style.reduced_color(reference)
+    grey = style.stretched(color)
+    tall = style.panel_size(grid, 4.2, 6.0)
+    columns = len(stages) + 1
+    figure = style.new_figure(
+        4.3 * columns + 0.5,
+        tall + 1.4,
+        "Orthomosaics of both surveys",
+        "overlay: grey where both agree, blue reference alone, red moving alone",
+    )
+    place = style.Place(grid)
+    for index, (name, moving) in enumerate(stages):
+        axes = figure.add_subplot(1, columns, index + 1)
+        moved, _ = style.reduced_color(moving)
+        overlay = style.two_tone(grey, style.stretched(moved))
+        axes.imshow(overlay, extent=place.extent(grid), interpolation="nearest")
+        axes.set_title(f"overlay, {name}", fontsize=10)
+        place.label(axes, inner=index > 0)
+    axes = figure.add_subplot(1, columns, columns)
+    moved, _ = style.reduced_color(stages[-1][1])
+    board = _chequerboard(color, moved)
+    axes.imshow(style.over_white(board), extent=place.extent(grid), interpolation="nearest")
+    axes.set_title(f"fields by turns from each survey, {stages[-1][0]}", fontsize=10)
+    place.label(axes, inner=True)
+    return figure
+
+
+def _stages(registration: Registration, key: str) -> list[tuple[str, SurveyRaster]]:
+    """Return the moving survey's rasters that there are: as delivered, then registered."""
+    named = (("before", f"{key}_before"), ("after", key))
+    evidence = registration.evidence
+    return [(name, evidence[k]) for name, k in named if evidence.get(k) is not None]
+
+
+def _busiest_column(reference: SurveyRaster, moving: SurveyRaster) -> int | None:
+    """Column with the most cells seen by both; the one nearest the middle among equals."""
+    shared = (reference.valid & moving.valid).sum(axis=0)
+    seen = shared if shared.any() else reference.valid.sum(axis=0)
+    if not seen.any():
+        return None
+    good = np.flatnonzero(seen >= 0.95 * seen.max())
+    centre = np.average(np.arange(seen.size), weights=seen)
+    return int(good[np.argmin(np.abs(good - centre))])
+
+
+def _profile(axes: Any, north: Any, raster: SurveyRaster, column: int, **look: Any) -> None:
+    height = raster.height[:, column].astype(np.float64) + raster.datum
+    axes.plot(north, height, **look)
+
+
+def _chequerboard(reference: Any, moving: Any, fields: int = 8) -> Any:
+    rows, cols = reference.shape[:2]
+    side = max(1, round(max(rows, cols) / fields))
+    row, col = np.mgrid[:rows, :cols] // side
+    take_moving = ((row + col) % 2 == 1)[..., None]
+    # Outside the overlap the survey that saw the field is shown.
+    unseen = np.where(take_moving, ~np.isfinite(moving), ~np.isfinite(reference))
+    return np.where(take_moving ^ unseen, moving, reference)

@@ -1,0 +1,132 @@
+"""A 3-D still of both surveys, rendered in a child process.
+
+VTK kills the process that runs it where OpenGL is missing, so it never runs in ours.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from meshreg.report import style
+from meshreg.types import Registration
+
+_LOG = logging.getLogger("meshreg")
+_SIDE = 350  # grid points along the longer side
+
+_CHILD = """
+import sys
+import numpy as np, pyvista as pv
+folder, target = sys.argv[1:]
+data = dict(np.load(folder + "/scene.npz"))
+east, north = np.meshgrid(data["east"], data["north"])
+plotter = pv.Plotter(off_screen=True, shape=(1, 2), window_size=(1800, 900), border=False)
+plotter.set_background("white")
+for column, (name, title) in enumerate((("reference", "reference"), ("moving", "registered"))):
+    plotter.subplot(0, column)
+    height = data[name]
+    seen = np.isfinite(height)
+    height = np.where(seen, height, data["floor"]) * data["exaggeration"]
+    surface = pv.StructuredGrid(east, north, height)
+    surface["color"] = data[name + "_color"].reshape(-1, 3, order="F")
+    surface["seen"] = seen.ravel(order="F").astype(np.uint8)
+    surface = surface.threshold(0.5, scalars="seen", all_scalars=True)
+    if surface.n_points:
+        plotter.add_mesh(surface, scalars="color", rgb=True, ambient=0.25, specular=0.0)
+    plotter.add_text(title, font_size=12, color="black")
+middle = [float(np.mean(data[k])) for k in ("east", "north")]
+span = max(float(np.ptp(data["east"])), float(np.ptp(data["north"])))
+top = float(np.nanmedian(data["reference"])) * float(data["exaggeration"])
+plotter.link_views()
+plotter.camera_position = [
+    (middle[0] - 0.5 * span, middle[1] - 1.25 * span, top + 0.95 * span), (*middle, top), (0, 0, 1)
+]
+plotter.screenshot(target)
+"""
+
+
+def draw_scene(registration: Registration, path: Path, seconds: float) -> Path | None:
+    """Render both surveys side by side to `path`; None, with a line in the log, if it cannot be."""
+    arrays = _arrays(registration)
+    if arrays is None:
+        return None
+    environment = {**os.environ, "PYTHONWARNINGS": "ignore"}
+    with tempfile.TemporaryDirectory(prefix="meshreg-") as folder:
+        np.savez(Path(folder, "scene.npz"), **arrays)
+        picture = Path(folder, "scene.png")
+        command = [sys.executable, "-c", _CHILD, folder, str(picture)]
+        try:
+            done = subprocess.run(
+                command,
+                capture_output=True,
+                text=True,
+                errors="replace",
+                timeout=seconds,
+                env=environment,
+                stdin=subprocess.DEVNULL,
+                check=False,
+            )
+        except (OSError, subprocess.TimeoutExpired) as error:
+            _LOG.info("No 3-D still: %s", error)
+            return None
+        if done.returncode != 0 or not picture.exists():
+            last = (done.stderr.strip().splitlines() or [f"exit code {done.returncode}"])[-1]
+            _LOG.info("No 3-D still: this machine cannot render (%s); see `meshreg doctor`.", last)
+            return None
+        path.write_bytes(picture.read_bytes())
+    return path
+
+
+def _arrays(registration: Registration) -> dict[str, Any] | None:
+    """Both heights with their colours on one coarse grid, local metres; None without a result."""
+    evidence = registration.evidence
+    reference, moving = evidence.get("reference_dem"), evidence.get("moving_dem")
+    if reference is None or moving is None:
+        return None
+    height, grid = style.reduced_height(reference, _SIDE)
+    moved, _ = style.reduced_height(moving, _SIDE)
+    if not (np.isfinite(height).any() and np.isfinite(moved).any()):
+        return None
+    base = float(np.nanmedian(height))
+    rows, cols = grid.shape
+    low, high = np.nanpercentile(height - base, [2, 98])
+    relief = max(float(high - low), 1e-6)
+    # Flat ground would show as a plate: relief is raised to a tenth of the width, never lowered.
+    exaggeration = max(1.0, min(20.0, 0.1 * max(rows, cols) * grid.cell / relief))
+    colors = [
+        _color_at(evidence.get(key), relief_map, grid)
+        for key, relief_map in (("reference_ortho", height), ("moving_ortho", moved))
+    ]
+    return {
+        "east": (np.arange(cols) + 0.5) * grid.cell,
+        "north": -(np.arange(rows) + 0.5) * grid.cell,
+        "reference": height - base,
+        "moving": moved - base,
+        "reference_color": colors[0],
+        "moving_color": colors[1],
+        "floor": float(min(np.nanmin(height), np.nanmin(moved))) - base,
+        "exaggeration": exaggeration,
+    }
+
+
+def _color_at(ortho: Any, height: Any, grid: Any) -> Any:
+    """(rows, cols, 3) uint8 from the orthomosaic; grey relief where there is no colour."""
+    shade = np.nan_to_num(style.hillshade(height, grid.cell), nan=0.7)
+    grey = np.repeat((60 + 180 * np.clip(shade, 0, 1)).astype(np.uint8)[..., None], 3, axis=-1)
+    if ortho is None or not ortho.color_valid.any():
+        return grey
+    row, col = np.mgrid[: grid.shape[0], : grid.shape[1]]
+    at_row, at_col = ortho.grid.row_col(*grid.east_north(row, col))
+    at_row, at_col = np.rint(at_row).astype(int), np.rint(at_col).astype(int)
+    rows, cols = ortho.grid.shape
+    inside = (at_row >= 0) & (at_row < rows) & (at_col >= 0) & (at_col < cols)
+    at_row, at_col = np.clip(at_row, 0, rows - 1), np.clip(at_col, 0, cols - 1)
+    seen = inside & ortho.color_valid[at_row, at_col]
+    return np.where(seen[..., None], ortho.color[at_row, at_col], grey)
