@@ -45,8 +45,8 @@ def sand_height(x, y, ground, finest):
 def rock_height(x, y, ground, finest):
     """Height of the rock [m], the shade of the lump here (0..1) and how much rubble covers it."""
     gain = 0.5**ground.hurst
-    wx = x + 0.10 * octaves(x, y, ground.seed + 1, 1.1, finest, 0.6, 3)
-    wy = y + 0.10 * octaves(x, y, ground.seed + 2, 1.1, finest, 0.6, 3)
+    wx = x + 0.06 * octaves(x, y, ground.seed + 1, 1.1, finest, 0.5, 2)
+    wy = y + 0.06 * octaves(x, y, ground.seed + 2, 1.1, finest, 0.5, 2)
     z = ground.relief * octaves(
         x, y, ground.seed + 3, ground.relief_wavelength, finest, gain, 5
     )

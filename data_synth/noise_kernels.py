@@ -104,14 +104,18 @@ def lumps(x, y, seed, presence):
             h = hash2(i, j, seed)
             if np.float64(h & np.uint32(0xFF)) >= presence * 256.0:
                 continue
-            k = hash2(i, j, seed + 7919)
-            cx = i + np.float64(h >> np.uint32(20)) / 4096.0
-            cy = j + np.float64((h >> np.uint32(8)) & np.uint32(0xFFF)) / 4096.0
-            radius = 0.28 + 0.22 * np.float64(k & np.uint32(0xFF)) / 256.0
-            dx, dy = (x - cx) / radius, (y - cy) / radius
+            dx = x - i - np.float64(h >> np.uint32(20)) / 4096.0
+            dy = y - j - np.float64((h >> np.uint32(8)) & np.uint32(0xFFF)) / 4096.0
+            if dx * dx + dy * dy > 0.25:
+                continue
+            k = np.uint32(h ^ (h >> np.uint32(15))) * np.uint32(0x2C1B3C6D)
+            k = np.uint32(k ^ (k >> np.uint32(12))) * np.uint32(0x297A2D39)
+            k = np.uint32(k ^ (k >> np.uint32(15)))
+            small = 1.0 / (0.28 + 0.22 * np.float64(k & np.uint32(0xFF)) / 256.0)
             # elongated in a direction of its own; the longest axis stays within half a cell
-            turn = np.float64((k >> np.uint32(8)) & np.uint32(0xFF)) / 256.0 * 2.0 - 1.0
-            side = np.sqrt(1.0 - turn * turn)
+            t = np.float64((k >> np.uint32(8)) & np.uint32(0xFF)) / 128.0 - 1.0
+            scale = small / (1.0 + t * t)
+            turn, side = (1.0 - t * t) * scale, 2.0 * t * scale
             a, b = turn * dx + side * dy, turn * dy - side * dx
             stretch = 1.0 + 0.8 * np.float64((k >> np.uint32(16)) & np.uint32(0xFF)) / 256.0
             d2 = a * a + b * b * stretch * stretch

@@ -33,7 +33,7 @@ _HOMES = {
     "Registration": "meshreg.types",
     "MeshregError": "meshreg.errors",
 }
-__all__ = ["__version__", *_HOMES]
+__all__ = ["__version__", *_HOMES]  # noqa: PLE0604
 
 logging.getLogger("meshreg").addHandler(logging.NullHandler())
 

@@ -125,9 +125,7 @@ def judge(
         return Judgement("rejected", "the surveys do not overlap within the search window", None)
     reach = agree_distance(settings.judge, rasters["dem"][0].grid.cell)
     candidates = _candidates(estimates, maps)
-    hypotheses = tuple(
-        sorted(_merge(candidates, maps, reach), key=lambda h: h.score, reverse=True)
-    )
+    hypotheses = tuple(sorted(_merge(candidates, maps, reach), key=lambda h: h.score, reverse=True))
     if not hypotheses:
         return Judgement("rejected", "no method found a candidate", None, maps=maps)
     return _verdict(hypotheses, maps, settings.judge, radius, reach)
@@ -208,9 +206,7 @@ def _merge(
             )
             places.append(place)
         overlap = max(_overlap_at(channel, (east, north)) for channel in maps.values())
-        scored.append(
-            Hypothesis(east, north, np.eye(2), gaps, values, (method,), overlap)
-        )
+        scored.append(Hypothesis(east, north, np.eye(2), gaps, values, (method,), overlap))
     scored.sort(key=lambda h: h.score, reverse=True)
     groups: list[list[Hypothesis]] = []
     for hypothesis in scored:
@@ -249,8 +245,10 @@ def _fused(
         weights, total = weights + weight, total + weight @ place
         best = sigma if best is None or np.trace(sigma) < np.trace(best) else best
     lead = group[0]
-    place = np.linalg.solve(weights, total) if best is not None else (lead.east, lead.north)
-    if best is None:
+    place = np.array([lead.east, lead.north])
+    if best is not None:
+        place = np.linalg.solve(weights, total)
+    else:
         cell = max(channel.window.cell for channel in maps.values())
         best = cell**2 * np.eye(2)
     methods = tuple(dict.fromkeys(m for member in group for m in member.methods))
@@ -294,7 +292,9 @@ def _verdict(
         return say("rejected", f"the moving survey fits only when {turned}: check its axes")
     if contradicting:
         where = " and ".join(contradicting)
-        return say("review", f"the channels contradict each other: {where} fits elsewhere ({words})")
+        return say(
+            "review", f"the channels contradict each other: {where} fits elsewhere ({words})"
+        )
     if alarm > settings.max_false_alarm and max(best.gaps.values()) < settings.support_gap:
         return say(
             "rejected",
@@ -305,7 +305,9 @@ def _verdict(
         return say("review", f"the surveys overlap by only {best.overlap:.0%} of what they could")
     edge = radius - max(abs(best.east), abs(best.north))
     if edge < 2 * max(channel.window.cell for channel in maps.values()):
-        return say("review", "the best offset is at the search border; try a larger --search-radius")
+        return say(
+            "review", "the best offset is at the search border; try a larger --search-radius"
+        )
     if turned:
         return say("review", f"the moving survey fits just as well when {turned}")
     if alarm > settings.max_false_alarm:

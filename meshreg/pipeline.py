@@ -106,9 +106,7 @@ def register_pair(
             if refined.note:
                 notes.append(refined.note)
     with clock.stage("apply"):
-        transform, up_sigma, rasters = _lay_down(
-            reference, moving, refined, settings, masks, pairs
-        )
+        transform, up_sigma, rasters = _lay_down(reference, moving, refined, settings, masks, pairs)
     return Registration(
         verdict=judgement.verdict,
         reason=judgement.reason,
@@ -117,12 +115,18 @@ def register_pair(
         estimates=tuple(estimates),
         hypotheses=tuple(_plain(h) for h in judgement.hypotheses[:5]),
         before=statistics.compare(
-            rasters["reference_dem"], rasters["moving_dem_before"],
-            rasters["reference_ortho"], rasters["moving_ortho_before"],
+            rasters["reference_dem"],
+            rasters["moving_dem_before"],
+            rasters["reference_ortho"],
+            rasters["moving_ortho_before"],
         ),
-        after={} if transform is None else statistics.compare(
-            rasters["reference_dem"], rasters["moving_dem"],
-            rasters["reference_ortho"], rasters["moving_ortho"],
+        after={}
+        if transform is None
+        else statistics.compare(
+            rasters["reference_dem"],
+            rasters["moving_dem"],
+            rasters["reference_ortho"],
+            rasters["moving_ortho"],
         ),
         reference=_about(reference),
         moving=_about(moving),
@@ -136,7 +140,8 @@ def register_pair(
             "channels": judgement.maps,
             "false_alarm": judgement.false_alarm,
             "masked": {
-                which: dict(pairs["dem"][i].masked) for i, which in enumerate(("reference", "moving"))
+                which: dict(pairs["dem"][i].masked)
+                for i, which in enumerate(("reference", "moving"))
             },
         },
     )
@@ -147,7 +152,15 @@ def versions() -> dict[str, str]:
     from importlib.metadata import PackageNotFoundError, version
 
     found = {"python": platform.python_version(), "platform": platform.platform()}
-    for name in ("meshreg", "numpy", "scipy", "numba", "opencv-python-headless", "rasterio", "pyproj"):
+    for name in (
+        "meshreg",
+        "numpy",
+        "scipy",
+        "numba",
+        "opencv-python-headless",
+        "rasterio",
+        "pyproj",
+    ):
         try:
             found[name] = version(name)
         except PackageNotFoundError:
@@ -180,7 +193,7 @@ def _check(reference: Survey, moving: Survey, settings: Settings) -> None:
     if reference.crs is not None and moving.crs is not None and reference.crs != moving.crs:
         raise UsageError(
             f"The surveys' CRS differ: {reference.crs} and {moving.crs}.",
-            remedy="Bring the moving survey to the reference's CRS with meshreg.io.frames.common_crs.",
+            remedy="Bring the moving one to the other's with meshreg.io.frames.common_crs.",
         )
     if reference.scale_known != moving.scale_known:
         which = moving if reference.scale_known else reference
@@ -200,30 +213,27 @@ def _gap_between(reference: Survey, moving: Survey) -> float:
 def _rasterize(
     reference: Survey, moving: Survey, settings: Settings, masks: Mapping[str, Any], tell: Progress
 ) -> Pairs:
-    """Both surveys at the three cells; the coarser are exact means of the finest where they fit."""
+    """Both surveys at each cell that is needed; where they fit, the coarser are exact means."""
     options = settings.raster
     cells = {"sift": options.sift_cell, "ortho": options.ortho_cell, "dem": options.dem_cell}
     needed = {ESTIMATORS[m].raster for m in settings.methods} | {"ortho", "dem"}
-    finest = min(float(cells[name] or 0) for name in needed)
-    made: dict[str, dict[str, SurveyRaster]] = {}
+    sizes = {name: float(cells[name] or 0.0) for name in needed}
+    finest, coarsest = min(sizes.values()), max(sizes.values())
+    made: dict[str, list[SurveyRaster]] = {name: [] for name in needed}
     for done, (which, survey) in enumerate((("reference", reference), ("moving", moving))):
-        base: dict[float, SurveyRaster] = {}
-        for name in sorted(needed, key=lambda n: float(cells[n] or 0)):
-            cell = float(cells[name] or 0)
-            times = cell / finest
-            if finest in base and abs(times - round(times)) < 1e-9:
-                lattice = round(max(float(cells[n] or 0) for n in needed) / finest)
-                fine = base[finest]
-                raster = fine if round(times) == 1 else coarsened(fine, round(times))
-                assert fine.grid.shape[0] % lattice == 0 or round(times) != lattice
+        mask = masks[which]
+        fine = rasterize(survey, survey_grid(survey, finest, coarsest), options, mask=mask)
+        for name, cell in sizes.items():
+            times = round(cell / finest)
+            if times == 1:
+                raster = fine
+            elif abs(cell - times * finest) < 1e-9 * cell:
+                raster = coarsened(fine, times)
             else:
-                snap = max(float(cells[n] or 0) for n in needed)
-                grid = survey_grid(survey, cell, snap)
-                raster = rasterize(survey, grid, options, mask=masks[which])
-            base[cell] = raster
-            made.setdefault(name, {})[which] = raster
+                raster = rasterize(survey, survey_grid(survey, cell), options, mask=mask)
+            made[name].append(raster)
         tell("rasterize", 0.5 * (done + 1))
-    return {name: (pair["reference"], pair["moving"]) for name, pair in made.items()}
+    return {name: (pair[0], pair[1]) for name, pair in made.items()}
 
 
 def _refine(judgement: judging.Judgement, pairs: Pairs, settings: Settings) -> Refined:
@@ -308,17 +318,35 @@ def _residuals(refined: Refined | None) -> dict[str, Float64]:
 
 
 def _too_far(
-    reference: Survey, moving: Survey, settings: Settings, away: float,
-    seconds: Mapping[str, float], notes: list[str],
+    reference: Survey,
+    moving: Survey,
+    settings: Settings,
+    away: float,
+    seconds: Mapping[str, float],
+    notes: list[str],
 ) -> Registration:
     reason = (
-        f"the surveys lie {away:.4g} m apart, beyond the search radius of {settings.search.radius:g} m; "
-        "check their shifts (--reference-shift, --moving-shift) and CRS"
+        f"the surveys lie {away:.4g} m apart, beyond the search radius of "
+        f"{settings.search.radius:g} m; check their shifts (--reference-shift, --moving-shift) and CRS"
     )
-    estimates = tuple(OffsetEstimate(m, "failed", "the surveys do not overlap") for m in settings.methods)
+    estimates = tuple(
+        OffsetEstimate(m, "failed", "the surveys do not overlap") for m in settings.methods
+    )
     return Registration(
-        "rejected", reason, None, None, estimates, (), {}, {}, _about(reference), _about(moving),
-        settings.as_dict(), versions(), dict(seconds), tuple(notes),
+        "rejected",
+        reason,
+        None,
+        None,
+        estimates,
+        (),
+        {},
+        {},
+        _about(reference),
+        _about(moving),
+        settings.as_dict(),
+        versions(),
+        dict(seconds),
+        tuple(notes),
     )
 
 
@@ -335,7 +363,7 @@ def _plain(hypothesis: judging.Hypothesis) -> dict[str, Any]:
 
 
 def _about(survey: Survey) -> dict[str, Any]:
-    """What the record says of a survey."""
+    """Return what the record says of a survey."""
     geometry = survey.geometry
     counts: dict[str, int] = {}
     for source in survey.source:

@@ -93,8 +93,7 @@ def refine(
         The refined offset may differ from the judged one by this much [m].
     """
     measured = [
-        tile_offsets(reference, moving, channel, offset)
-        for reference, moving, channel in rasters
+        tile_offsets(reference, moving, channel, offset) for reference, moving, channel in rasters
     ]
     tiles = _joined([m for m in measured if m is not None])
     centre = _overlap_centre(rasters[0][0], rasters[0][1], offset)
@@ -181,9 +180,9 @@ def _match_tile(
         cell,
         steps + (top + shift[0] - t),
         steps + (left + shift[1] - l),
-        steps * cell,
-        -steps * cell,
-        (a[0].mask.shape, b[0].mask.shape),  # type: ignore[arg-type]
+        np.asarray(steps * cell, np.float64),
+        np.asarray(-steps * cell, np.float64),
+        (a[0].mask.shape, b[0].mask.shape),
     )
     surface, _ = neutral.surface(a, b, window, 0.5)
     peak = find_peak(surface, window.east, window.north, exclusion=3 * cell)
@@ -267,7 +266,9 @@ def _joined(parts: Sequence[TileOffsets]) -> TileOffsets | None:
     places = np.concatenate([p.places for p in parts])
     n_side = max(2, round(np.sqrt(max(len(p.places) for p in parts))))
     low, high = places.min(axis=0), places.max(axis=0)
-    bins = np.minimum(((places - low) / np.maximum(high - low, 1e-9) * n_side).astype(int), n_side - 1)
+    bins = np.minimum(
+        ((places - low) / np.maximum(high - low, 1e-9) * n_side).astype(int), n_side - 1
+    )
     return TileOffsets(
         places,
         np.concatenate([p.offsets for p in parts]),

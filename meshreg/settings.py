@@ -39,7 +39,9 @@ class RasterSettings:
 class SearchSettings:
     """The window of offsets, shared by the methods."""
 
-    radius: float | None = None  # per axis [m]; None: 10 m, more where the DEM is coarser than 0.10 m
+    radius: float | None = (
+        None  # per axis [m]; None: 10 m, more where the DEM is coarser than 0.10 m
+    )
     min_overlap: float = 0.30  # of the largest possible overlap; smaller ones are not scored
 
 
@@ -123,7 +125,7 @@ class Settings:
 
     def as_dict(self) -> dict[str, Any]:
         """Plain nested dictionaries, for TOML and JSON (None is left out)."""
-        return _without_none(dataclasses.asdict(self))
+        return dict(_without_none(dataclasses.asdict(self)))
 
 
 def read_settings(path: str | Path, base: Settings | None = None) -> Settings:
@@ -152,7 +154,7 @@ def write_settings(settings: Settings) -> str:
     """Return the settings as TOML text that `read_settings` reads back to the same record."""
     import tomli_w
 
-    return tomli_w.dumps(settings.as_dict())
+    return str(tomli_w.dumps(settings.as_dict()))
 
 
 def _flat(document: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
@@ -191,7 +193,7 @@ def _coerce(key: str, value: Any, kind: str) -> Any:
     """Fit a TOML value (or its text) to the annotation `kind`; the annotation is the one schema."""
     optional = kind.endswith(" | None")
     base = kind.removesuffix(" | None")
-    if isinstance(value, str) and not (base == "str" or base == "Preset"):
+    if isinstance(value, str) and base not in ("str", "Preset"):
         if optional and value.lower() in ("none", "auto", ""):
             return None
         if base == "tuple[str, ...]" and not value.startswith("["):

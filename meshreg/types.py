@@ -329,12 +329,12 @@ class Survey:
         points = self.geometry.points
         if isinstance(self.geometry, Mesh) and len(self.geometry.faces):
             points = points[np.unique(self.geometry.faces)]
-        return np.stack([points.min(axis=0), points.max(axis=0)]) + self.origin
+        return np.asarray(np.stack([points.min(axis=0), points.max(axis=0)]) + self.origin)
 
     @property
     def centre(self) -> Float64:
         """(3,) float64: centre of `bounds`, absolute [m]."""
-        return self.bounds.mean(axis=0)
+        return np.asarray(self.bounds.mean(axis=0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -442,7 +442,7 @@ class Transform:
     def apply(self, points: Any) -> Float64:
         """Move absolute points (..., 3) [m]."""
         points = np.asarray(points, float)
-        return (points - self.pivot) @ self.linear.T + (self.pivot + self.offset)
+        return np.asarray((points - self.pivot) @ self.linear.T + (self.pivot + self.offset))
 
     def inverse(self) -> Transform:
         """Return the transform that takes reference back to moving."""
@@ -455,7 +455,7 @@ class Transform:
         return Transform(self.rotation, self.scale, self.apply(pivot) - pivot, pivot)
 
     def __matmul__(self, first: Transform) -> Transform:
-        """``(a @ b).apply(x) == a.apply(b.apply(x))``."""
+        """Chain two transforms: ``(a @ b).apply(x) == a.apply(b.apply(x))``."""
         middle = first.pivot + first.offset
         offset = first.offset + self.apply(middle) - middle
         return Transform(

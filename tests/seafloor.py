@@ -27,7 +27,12 @@ class Seafloor:
         """Bumps of 5 cm to 3 m, heights in proportion to their radius (fractal-like relief)."""
         rng = np.random.default_rng(seed)
         parts = []
-        for radius, number, rise in ((2.5, 3.0, 0.25), (0.8, 20.0, 0.12), (0.25, 150.0, 0.05), (0.1, 700.0, 0.015)):
+        for radius, number, rise in (
+            (2.5, 3.0, 0.25),
+            (0.8, 20.0, 0.12),
+            (0.25, 150.0, 0.05),
+            (0.1, 700.0, 0.015),
+        ):
             count = int(number * (size / 10) ** 2)
             parts.append(
                 (
@@ -38,7 +43,7 @@ class Seafloor:
                     contrast * 25 * rng.normal(size=count),
                 )
             )
-        return cls(*(np.concatenate(column) for column in zip(*parts)))
+        return cls(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
     def changed(self, seed: int, share: float):
         """Replace `share` of the bumps by others; repaint as many."""
@@ -73,13 +78,15 @@ class Seafloor:
         centre: tuple[float, float] = (0.0, 0.0),
         gain: float = 1.0,
     ) -> SurveyRaster:
-        """Square survey of `2 half` metres around `centre`, on a lattice of multiples of the cell."""
-        n = int(round(2 * half / cell))
+        """Square of `2 half` metres around `centre`, on the lattice of the cell's multiples."""
+        n = round(2 * half / cell)
         west = round((centre[0] - half) / cell) * cell
         north = round((centre[1] + half) / cell) * cell
         grid = Grid(west, north, cell, (n, n))
         z, grey = np.zeros((n, n)), np.full((n, n), 110.0)
-        for e, nn, r, h, b in zip(self.east, self.north, self.radius, self.height, self.brightness):
+        for e, nn, r, h, b in zip(
+            self.east, self.north, self.radius, self.height, self.brightness, strict=True
+        ):
             row, col = grid.row_col(e, nn)
             reach = 3.5 * r / cell
             r0, r1 = max(int(row - reach), 0), min(int(row + reach) + 2, n)
@@ -99,12 +106,21 @@ class Seafloor:
         return SurveyRaster(grid, z, color, full, full, full.astype(np.uint16), datum=0.0)
 
 
-def rasters(seed: int = 0, offset=(1.237, -2.412), yaw: float = 0.0, up: float = 0.03, change: float = 0.3, cells=(0.1, 0.05), half: float = 9.0, **kind):
-    """A pair as the pipeline has it: {"dem", "ortho"} to (reference, moving), and the true offset."""
+def rasters(
+    seed: int = 0,
+    offset=(1.237, -2.412),
+    yaw: float = 0.0,
+    up: float = 0.03,
+    change: float = 0.3,
+    cells=(0.1, 0.05),
+    half: float = 9.0,
+    **kind,
+):
+    """Return {"dem", "ortho"} to (reference, moving), whose true offset is `offset`."""
     floor = Seafloor.random(seed, **kind)
     later = floor.changed(seed + 1, change).moved(-offset[0], -offset[1], yaw)
     pair = {}
-    for name, cell in zip(("dem", "ortho"), cells):
+    for name, cell in zip(("dem", "ortho"), cells, strict=True):
         pair[name] = (
             floor.raster(cell, half, seed=seed + 2),
             later.raster(cell, half, up=-up, seed=seed + 3, gain=0.8),

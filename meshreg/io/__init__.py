@@ -5,3 +5,240 @@ lines here. Each entry names a function by "module:function", imported at first 
 """
 
 from __future__ import annotations
+
+import dataclasses
+import importlib
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from meshreg.errors import InputError, UsageError
+from meshreg.io.options import ReadOptions
+
+if TYPE_CHECKING:
+    from meshreg.io.record import read_registration as read_registration
+    from meshreg.io.record import write_registration as write_registration
+    from meshreg.types import Survey, Transform
+
+READERS: dict[str, str] = {
+    ".obj": "meshreg.io.obj:read",
+    ".ply": "meshreg.io.ply:read",
+    ".glb": "meshreg.io.gltf:read",
+    ".gltf": "meshreg.io.gltf:read",
+    ".stl": "meshreg.io.gltf:read",
+    ".off": "meshreg.io.gltf:read",
+    ".las": "meshreg.io.cloud:read",
+    ".laz": "meshreg.io.cloud:read",
+    ".e57": "meshreg.io.e57:read",
+    ".xyz": "meshreg.io.xyz:read",
+    ".csv": "meshreg.io.xyz:read",
+    ".txt": "meshreg.io.xyz:read",
+    ".asc": "meshreg.io.xyz:read",
+    ".pts": "meshreg.io.xyz:read",
+    ".tif": "meshreg.io.maps:read",
+    ".tiff": "meshreg.io.maps:read",
+    "": "meshreg.io.colmap:read",  # a folder
+}
+WRITERS: dict[str, str] = {
+    ".obj": "meshreg.io.obj:write",
+    ".ply": "meshreg.io.ply:write",
+    ".glb": "meshreg.io.gltf:write",
+    ".las": "meshreg.io.cloud:write",
+    ".laz": "meshreg.io.cloud:write",
+    ".e57": "meshreg.io.e57:write",
+    ".xyz": "meshreg.io.xyz:write",
+    ".csv": "meshreg.io.xyz:write",
+    ".txt": "meshreg.io.xyz:write",
+    ".tif": "meshreg.io.maps:write",
+}
+REWRITERS: dict[str, str] = {
+    "obj": "meshreg.io.obj:rewrite",
+    "ply": "meshreg.io.ply:rewrite",
+    "glb": "meshreg.io.gltf:rewrite",
+    "gltf": "meshreg.io.gltf:rewrite",
+    "stl": "meshreg.io.gltf:rewrite",
+    "off": "meshreg.io.gltf:rewrite",
+    "las": "meshreg.io.cloud:rewrite",
+    "e57": "meshreg.io.e57:rewrite",
+    "xyz": "meshreg.io.xyz:rewrite",
+    "colmap": "meshreg.io.colmap:rewrite",
+    "maps": "meshreg.io.maps:rewrite",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name in ("read_registration", "write_registration"):
+        return getattr(importlib.import_module("meshreg.io.record"), name)
+    raise AttributeError(f"module 'meshreg.io' has no attribute {name!r}")
+
+
+def load(entry: str) -> Callable[..., Any]:
+    """Import the function that a table's "module:function" names."""
+    module, _, name = entry.partition(":")
+    function: Callable[..., Any] = getattr(importlib.import_module(module), name)
+    return function
+
+
+def read_survey(
+    path: str | Path | Sequence[str | Path],
+    options: ReadOptions | None = None,
+    **overrides: Any,
+) -> Survey:
+    """Read one survey: a mesh, a point cloud, or a DEM with its orthomosaic.
+
+    Parameters
+    ----------
+    path : path, glob or sequence of paths
+        A file; a folder with files of one format, or a COLMAP model folder; a glob ("site/*.las");
+        a list; "dem.tif,ortho.tif". Several files are blocks of one survey and are merged.
+    options : ReadOptions, optional
+        What the files do not say themselves: shift, axes, up, unit, CRS.
+    **overrides
+        Single fields of `ReadOptions`, e.g. ``shift=(731000, 5705000, 0)``.
+
+    Returns
+    -------
+    Survey
+        Metres, x east, y north, z up; `source` names each file with its frame and checksum,
+        `notes` says what was dropped, repaired or guessed.
+
+    Raises
+    ------
+    InputError
+        A missing, empty, damaged or unknown file; a folder of several formats; blocks that do not
+        fit together.
+    UnsafeReferenceError
+        A file that refers to something outside its folder.
+    ResourceLimitError
+        A texture page over `max_pixels`.
+    UsageError
+        An unknown option.
+    """
+    from meshreg.io import blocks
+
+    options = options or ReadOptions()
+    known = {item.name for item in dataclasses.fields(ReadOptions)}
+    if unknown := sorted(overrides.keys() - known):
+        raise UsageError(f"unknown option {unknown[0]!r}.", remedy=f"There are {sorted(known)}.")
+    options = dataclasses.replace(options, **overrides)
+    found = blocks.find_blocks(path)
+    surveys = [blocks.read_block(block, options) for block in found]
+    return surveys[0] if len(surveys) == 1 else blocks.merge(surveys, path)
+
+
+def write_survey(survey: Survey, path: str | Path) -> tuple[Path, ...]:
+    """Write a survey from memory to a new file; its suffix chooses the format.
+
+    Returns
+    -------
+    tuple of Path
+        All files written: the survey, its textures, its shift sidecar.
+
+    Raises
+    ------
+    UsageError
+        A suffix that is not written, or a geometry that the format cannot hold.
+    OutputError
+        The file could not be written; what was there before is intact.
+    """
+    path = Path(path)
+    entry = WRITERS.get(path.suffix.lower())
+    if entry is None:
+        raise UsageError(
+            f"{path.name!r}: surveys are not written as {path.suffix or 'a file without suffix'}.",
+            remedy=f"Use one of {', '.join(WRITERS)}.",
+        )
+    files: tuple[Path, ...] = load(entry)(survey, path)
+    return files
+
+
+def rewrite_survey(
+    survey: Survey,
+    transform: Transform,
+    folder: str | Path,
+    reference: Survey | None = None,
+    stem_suffix: str = "_registered",
+) -> tuple[Path, ...]:
+    """Move every file of a survey, each in its own format, into the reference's coordinates.
+
+    Parameters
+    ----------
+    survey : Survey
+        The moving survey, as read from files.
+    transform : Transform
+        `reference_from_moving`, absolute.
+    folder : path
+        Where the files go, under their names with `stem_suffix`; made where missing.
+    reference : Survey, optional
+        Its first file's axes, shift and CRS are what the files are written in; without it they
+        keep their own.
+    stem_suffix : str
+
+    Returns
+    -------
+    tuple of Path
+        All files written, textures and shift sidecars included.
+
+    Raises
+    ------
+    UsageError
+        The survey has no files.
+    OutputError
+        A file could not be written, or did not read back as it should.
+    InputError
+        A source file has changed or gone since it was read.
+    """
+    from meshreg.io import blocks
+
+    return blocks.rewrite(survey, transform, Path(folder), reference, stem_suffix)
+
+
+def unchanged(survey: Survey) -> None:
+    """Make sure that a survey's files are still those that were read.
+
+    Raises
+    ------
+    InputError
+        A file's size or time of change differs, and so does its checksum.
+    """
+    from meshreg.io.safe import fingerprint, sha256
+
+    for source in survey.source:
+        if not source.sha256 or not source.path.is_file():
+            if source.sha256 and not source.path.exists():
+                raise InputError("has gone since it was read.", file=source.path)
+            continue
+        if fingerprint(source.path) != source.fingerprint and sha256(source.path) != source.sha256:
+            raise InputError(
+                "has changed since it was read.",
+                file=source.path,
+                remedy="Run again when nothing writes to it.",
+            )
+
+
+def same_files(reference: Survey, moving: Survey) -> str | None:
+    """Return a warning where both surveys came from the same bytes, else None."""
+    known = {source.sha256: source.path for source in reference.source if source.sha256}
+    for source in moving.source:
+        if source.sha256 in known:
+            return (
+                f"{known[source.sha256].name} and {source.path.name} are the same file: "
+                "any offset found is zero by construction."
+            )
+    return None
+
+
+__all__ = [
+    "READERS",
+    "REWRITERS",
+    "WRITERS",
+    "ReadOptions",
+    "load",
+    "read_registration",
+    "read_survey",
+    "rewrite_survey",
+    "same_files",
+    "unchanged",
+    "write_registration",
+    "write_survey",
+]

@@ -125,6 +125,11 @@ def assemble_survey(path: Path, raw: RawGeometry, found: Found, options: ReadOpt
     )
 
 
+def _rows(values: NDArray[np.bool_]) -> Bool:
+    """Return which rows of (N, K) are True throughout, as (N,)."""
+    return np.asarray(values.all(axis=1))
+
+
 def _keep_points(raw: RawGeometry, keep: Bool) -> RawGeometry:
     """Leave out points; faces must not use them any more."""
     faces = raw.faces
@@ -145,7 +150,7 @@ def _keep_faces(raw: RawGeometry, keep: Bool) -> RawGeometry:
 
 def _without_lost_points(raw: RawGeometry, path: Path) -> tuple[RawGeometry, tuple[str, ...]]:
     """Leave out points that are not finite, and the faces that touch them."""
-    finite = np.isfinite(raw.points).all(axis=1)
+    finite = _rows(np.isfinite(raw.points))
     lost = len(finite) - int(np.count_nonzero(finite))
     if not lost:
         return raw, ()
@@ -160,7 +165,7 @@ def _without_lost_points(raw: RawGeometry, path: Path) -> tuple[RawGeometry, tup
         )
     text = f"{lost} points that are NaN or infinite were dropped"
     if raw.faces is not None:
-        whole = finite[raw.faces].all(axis=1)
+        whole = _rows(finite[raw.faces])
         text += f", with {len(whole) - int(np.count_nonzero(whole))} faces that touch them"
         raw = _keep_faces(raw, whole)
     return _keep_points(raw, finite), (text + ".",)
@@ -189,7 +194,7 @@ def _uv_notes(raw: RawGeometry) -> tuple[str, ...]:
     if raw.uv is None or raw.face_texture is None:
         return ()
     textured = raw.face_texture >= 0
-    outside = ((raw.uv < -1e-4) | (raw.uv > 1 + 1e-4)).any(axis=2)
+    outside: Bool = np.logical_or(raw.uv < -1e-4, raw.uv > 1 + 1e-4).any(axis=2)  # type: ignore[assignment]
     n_outside = int(np.count_nonzero(outside[textured]))
     share = n_outside / max(3 * int(np.count_nonzero(textured)), 1)
     if share <= _MOST_WRAPPED:
@@ -210,7 +215,7 @@ def without_broken_uv(
         -1 on those faces.
     notes : tuple of str
     """
-    good = np.isfinite(uv).all(axis=(1, 2))
+    good = _rows(np.isfinite(uv).reshape(len(uv), 6))
     lost = int(np.count_nonzero(~good & (face_texture >= 0)))
     if good.all():
         return uv, face_texture, ()

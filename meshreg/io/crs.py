@@ -156,8 +156,18 @@ def vertical_datum(crs: Any) -> str | None:
     if vertical is None:
         return None
     if vertical.is_vertical:
-        return str(vertical.datum.name)
+        name = str(vertical.datum.name)
+        return None if name.lower().startswith("unknown") else name
     return f"ellipsoidal height, {horizontal_part(crs).geodetic_crs.datum.name}"
+
+
+@lru_cache(maxsize=64)
+def with_vertical_unit(value: str, metres: float) -> str:
+    """Add heights in a unit of this many metres, above a datum that nobody states, to a 2-D CRS."""
+    flat = parse_crs(value)
+    axis = f'AXIS["height (H)",up,LENGTHUNIT["{metres:.9g} m",{metres!r}]]'
+    height = f'VERTCRS["unknown height",VDATUM["unknown"],CS[vertical,1],{axis}]'
+    return f'COMPOUNDCRS["{flat.name} + unknown height",{flat.to_wkt()},{height}]'
 
 
 def metres_up(crs: Any) -> float:
@@ -251,16 +261,17 @@ def check_area(value: str, x: float, y: float, z: float = 0.0) -> None:
 
 
 @lru_cache(maxsize=256)
-def _is_metric(value: str) -> bool:
-    crs = parse_crs(value)
-    horizontal = horizontal_part(crs)
+def _is_metric_grid(value: str) -> bool:
+    """Whether the horizontal part is in metres east and north."""
+    horizontal = horizontal_part(parse_crs(value))
     if not horizontal.is_projected:
         return False
     axes = horizontal.axis_info
+    directions = {axis.direction for axis in axes}  # polar grids have two of "north" or "south"
     return (
         all(abs(axis.unit_conversion_factor - 1) < 1e-9 for axis in axes)
-        and not {"west", "south"} & {axis.direction for axis in axes if len(axes) == 2}
-        and abs(metres_up(crs) - 1) < 1e-9
+        and "west" not in directions
+        and directions != {"east", "south"}
     )
 
 
@@ -291,40 +302,44 @@ def metric_crs(value: str, centre: Any) -> str | None:
         return None
     x, y, *z = (float(item) for item in centre)
     lon, lat = lonlat(text, x, y, *z)
-    if _is_metric(text):
+    if _is_metric_grid(text):
         scale, _ = grid_scale_and_convergence(text, x, y)
         if abs(scale - 1) <= _MAX_SCALE_ERROR or abs(lat) > 84:
-            return text
+            return text if abs(metres_up(parse_crs(text)) - 1) < 1e-9 else _metric(text, None)
     lon = (lon + 180) % 360 - 180
-    return _utm(text, min(int((lon + 180) // 6) + 1, 60), "N" if lat >= 0 else "S")
+    zone = min(int((lon + 180) // 6) + 1, 60)
+    return _metric(text, f"{zone}{'N' if lat >= 0 else 'S'}")
 
 
 @lru_cache(maxsize=64)
-def _utm(value: str, zone: int, hemisphere: str) -> str | None:
-    """Return UTM on the datum of `value`, heights as there but in metres upward."""
-    from pyproj.crs import CompoundCRS, GeographicCRS, ProjectedCRS, VerticalCRS
-    from pyproj.crs.coordinate_operation import UTMConversion
+def _metric(value: str, zone: str | None) -> str | None:
+    """Return a CRS on the same datums in metres: its own grid, or UTM where a zone is given."""
+    from pyproj.crs import CompoundCRS, VerticalCRS
     from pyproj.crs.coordinate_system import VerticalCS
 
     crs = parse_crs(value)
     horizontal, vertical = horizontal_part(crs), vertical_part(crs)
+    flat = parse_crs(str(text_of(horizontal if zone is None else _utm(horizontal, zone))))
+    if horizontal.is_geocentric or (vertical is not None and not vertical.is_vertical):
+        return text_of(flat.to_3d())
+    if vertical is None or vertical_datum(crs) is None:
+        return text_of(flat)
+    # The registry's name for the same heights in metres, so that it is recognised there.
+    label = re.sub(r"\s*\(.*?\)", "", vertical.name).replace("depth", "height")
+    high = VerticalCRS(name=label, datum=vertical.datum, vertical_cs=VerticalCS())
+    return text_of(CompoundCRS(f"{flat.name} + {high.name}", [flat, high]))
+
+
+def _utm(horizontal: Any, zone: str) -> Any:
+    from pyproj.crs import GeographicCRS, ProjectedCRS
+    from pyproj.crs.coordinate_operation import UTMConversion
+
     base = horizontal.geodetic_crs
     if horizontal.is_geocentric:
         base = GeographicCRS(name=horizontal.datum.name, datum=horizontal.datum)
-    name = f"{base.name} / UTM zone {zone}{hemisphere}"
-    flat = ProjectedCRS(
-        conversion=UTMConversion(str(zone), hemisphere), geodetic_crs=base, name=name
-    )
-    flat = parse_crs(str(text_of(flat)))
-    if horizontal.is_geocentric or (vertical is not None and not vertical.is_vertical):
-        return text_of(flat.to_3d())
-    if vertical is None:
-        return text_of(flat)
-    datum = vertical.datum
-    # The registry's name for the same heights in metres, so that it is recognised there.
-    label = re.sub(r"\s*\(.*?\)", "", vertical.name).replace("depth", "height")
-    high = VerticalCRS(name=label, datum=datum, vertical_cs=VerticalCS())
-    return text_of(CompoundCRS(f"{flat.name} + {high.name}", [flat, high]))
+    conversion = UTMConversion(zone[:-1], zone[-1])
+    name = f"{base.name} / UTM zone {zone}"
+    return ProjectedCRS(conversion=conversion, geodetic_crs=base, name=name)
 
 
 def grid_scale_and_convergence(crs: str, east: float, north: float) -> tuple[float, float]:

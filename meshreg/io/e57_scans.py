@@ -103,7 +103,7 @@ def pieces(
             if spherical:
                 local = cartesian(local)
             xyz = local @ rotation.T + scan.translation
-            valid: Bool = np.isfinite(xyz).all(axis=1)
+            valid = np.asarray(np.isfinite(xyz).all(axis=1))
             if state in data:
                 valid = valid & (data[state] == 0)
             rgb = np.stack([data[name] for name in COLORS], axis=1) if has_color else None

@@ -349,9 +349,9 @@ def _grid_note(survey: Survey) -> str:
 def registered_frame(reference: SourceFile, moving: SourceFile, *, centre: Any = None) -> Frame:
     """Return the frame that the registered moving file is written in: the reference file's.
 
-    glTF keeps its own axes (the format says Y up), in metres, with the reference's shift. A
-    format of 32-bit numbers gets a round shift of its own at `centre` where the reference's would
-    leave numbers that step by more than 0.1 mm.
+    glTF keeps its own axes (the format says Y up), in metres, with the reference's shift. Where
+    that shift would leave glTF or STL, which know 32-bit numbers only, with coordinates that step
+    by more than 0.1 mm, they get a round shift of their own at `centre`.
 
     Parameters
     ----------
@@ -364,15 +364,15 @@ def registered_frame(reference: SourceFile, moving: SourceFile, *, centre: Any =
     own_axes = moving.format in ("glb", "gltf")
     if own_axes:
         unit = float(np.cbrt(abs(np.linalg.det(moving.frame.axes))))
-        metric = frame.crs is None or frame.file_crs == frame.crs
-        shift = frame.shift if metric else np.zeros(3)
+        shift = frame.shift if frame.is_linear else np.zeros(3)
         frame = Frame(moving.frame.axes / unit, shift, frame.crs, frame.crs)
-    if centre is None or not (own_axes or moving.counts.get("single_precision")):
+    if centre is None or not (own_axes or moving.format == "stl"):
         return frame
     local = to_file(frame, np.atleast_2d(centre))
     if float(np.spacing(np.abs(local).max().astype(np.float32))) <= 1e-4:
         return frame
-    return Frame(frame.axes, np.round(np.asarray(centre, float)), frame.crs, frame.crs)
+    axes = frame.axes if frame.is_linear else ENU
+    return Frame(axes, np.round(np.asarray(centre, float)), frame.crs, frame.crs)
 
 
 __all__ = [

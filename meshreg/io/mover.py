@@ -34,6 +34,11 @@ def to_file(frame: Frame, xyz: Any) -> Float64:
     return np.asarray((points - frame.shift) @ np.linalg.inv(frame.axes).T)
 
 
+def is_plain(frame: Frame) -> bool:
+    """Whether a file's coordinates are those of its CRS: no shift, x east, y north, z up."""
+    return not frame.shift.any() and bool((frame.axes == np.eye(3)).all())
+
+
 @dataclass(frozen=True, eq=False)
 class Mover:
     """Moves one file's coordinates into another frame (`make_mover`).

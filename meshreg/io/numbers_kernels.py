@@ -87,6 +87,24 @@ def _scaled(digits: Any, power: int) -> tuple[float, bool]:
 
 
 @jit(nogil=True)
+def _exponent(data: Any, here: int, end: int) -> tuple[int, int]:
+    """Read "e-5" at `here`; return its value and where it ends (-1: it is none)."""
+    if (data[here] != 101 and data[here] != 69) or end - here > 6:
+        return 0, -1
+    here += 1
+    negative = here < end and data[here] == 45
+    if here < end and (negative or data[here] == 43):
+        here += 1
+    if here == end:
+        return 0, -1
+    value = 0
+    while here < end and 48 <= data[here] <= 57:
+        value = 10 * value + (data[here] - 48)
+        here += 1
+    return (-value if negative else value), here
+
+
+@jit(nogil=True)
 def parse_number(data: Any, start: int, end: int) -> tuple[float, bool]:
     """Read the decimal number that fills data[start:end].
 
@@ -126,19 +144,9 @@ def parse_number(data: Any, start: int, end: int) -> tuple[float, bool]:
         here += 1
     if n_seen == 0:
         return np.nan, False
-    if here < end and (data[here] == 101 or data[here] == 69):
-        here += 1
-        sign = 1
-        if here < end and (data[here] == 45 or data[here] == 43):
-            sign = -1 if data[here] == 45 else 1
-            here += 1
-        if here == end or end - here > 4:
-            return np.nan, False
-        exponent = 0
-        while here < end and 48 <= data[here] <= 57:
-            exponent = 10 * exponent + (data[here] - 48)
-            here += 1
-        power += sign * exponent
+    if here < end:
+        exponent, here = _exponent(data, here, end)
+        power += exponent
     if here != end:
         return np.nan, False
     value, known = _scaled(digits, power)

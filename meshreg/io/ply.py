@@ -8,7 +8,6 @@ mix triangles and quads, and puts the last of several texture pages on all faces
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +22,7 @@ from meshreg.io.assemble import (
 )
 from meshreg.io.images import open_texture
 from meshreg.io.options import ReadOptions
-from meshreg.io.ply_body import Table, read_tables
+from meshreg.io.ply_body import Table, read_tables, scalar_columns
 from meshreg.io.ply_header import Header, read_header
 from meshreg.io.ply_write import rewrite, write
 from meshreg.io.polygons import Triangles, triangulate
@@ -76,11 +75,9 @@ def read(path: Path, options: ReadOptions) -> Survey:
         )
     tables = read_tables(header, file_bytes(path), path, ("vertex", "face"))
     notes: list[str] = []
-    points = _columns(tables["vertex"], _XYZ, np.float64)
+    points = scalar_columns(tables["vertex"], _XYZ, np.float64)
     colors = _colors(tables["vertex"], notes)
     counts = {"vertices": len(points)}
-    if vertex.properties[vertex.column("x") or 0].kind == "f4" and header.order:
-        counts["single_precision"] = 1
     face = tables.get("face")
     if face is None or not face.element.count:
         raw = RawGeometry(points, None, colors)
@@ -107,29 +104,11 @@ def read(path: Path, options: ReadOptions) -> Survey:
     return assemble_survey(path, raw, found, options)
 
 
-def _columns(table: Table, names: tuple[str, ...], dtype: Any) -> NDArray[Any]:
-    """Decode several scalar columns into (rows, len(names)); dtype None keeps the file's type."""
-    columns = []
-    for name in names:
-        number = table.element.column(name)
-        assert number is not None
-        counts, values = table.column(number)
-        if counts is not None:
-            raise InputError(
-                f"has {name!r} as a list.", file=table.file, place=table.element.name
-            )
-        columns.append(values)
-    out = np.empty((table.element.count, len(names)), dtype or columns[0].dtype.newbyteorder("="))
-    for k, column in enumerate(columns):
-        out[:, k] = column
-    return out
-
-
 def _colors(vertex: Table, notes: list[str]) -> NDArray[np.uint8] | None:
     for names in _COLORS:
         numbers = [vertex.element.column(name) for name in names]
         if all(number is not None for number in numbers):
-            colors, more = eight_bit_colors(_columns(vertex, names, None))
+            colors, more = eight_bit_colors(scalar_columns(vertex, names, None))
             notes += more
             return colors
     return None
@@ -178,7 +157,7 @@ def _texture_coordinates(
             if header.textures:
                 notes.append("Texture pages are named, but there are no texture coordinates.")
             return nothing
-        uv = _columns(vertex, names, np.float32)[faces]
+        uv = scalar_columns(vertex, names, np.float32)[faces]
     if not header.textures:
         notes.append("Texture coordinates were left out: no texture page is named.")
         return nothing
@@ -259,6 +238,10 @@ def _open_pages(
         if page.name != Path(decode_name(name).replace("\\", "/")).name:
             notes.append(f"Texture page {decode_name(name)!r} was found as {page.name!r}.")
         companions.append(page)
-        textures.append(open_texture(page, options.max_pixels, notes=notes))
+        try:
+            textures.append(open_texture(page, options.max_pixels, notes=notes))
+        except InputError as error:
+            notes.append(f"Texture page {page.name!r} {error.message} Its faces have no colour.")
+            continue
         new[number] = len(textures) - 1
     return tuple(textures), tuple(companions), new

@@ -8,7 +8,7 @@ into the mapped file.
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,9 @@ from meshreg.types import Float64, UInt8
 
 _CUT = "The file is cut off or damaged; export or copy it again."
 _NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
-_NOT_FINITE = re.compile(r"[+-]?(?:(nan|1\.#(?:qnan|snan|ind)0*)(?:\([a-z0-9]*\))?|inf|infinity|1\.#inf0*)")
+_NOT_FINITE = re.compile(
+    r"[+-]?(?:(nan|1\.#(?:qnan|snan|ind)0*)(?:\([a-z0-9]*\))?|inf|infinity|1\.#inf0*)"
+)
 _NO_FLOATS = np.empty(0, np.float64)
 _NO_INTS = np.empty(0, np.int64)
 
@@ -45,6 +47,8 @@ class Table:
     values : (P,) int64
         Values of each property in all rows.
     file : Path
+    where : (start, end)
+        Bytes of the file that hold the rows.
     """
 
     element: Element
@@ -56,6 +60,7 @@ class Table:
     row: np.dtype[Any] | None
     values: NDArray[np.int64]
     file: Path
+    where: tuple[int, int] = (0, 0)
 
     @property
     def is_text(self) -> bool:
@@ -102,7 +107,9 @@ class Table:
         return counts, out.view(self.kind(number))
 
 
-def read_tables(header: Header, data: UInt8, path: Path, wanted: tuple[str, ...]) -> dict[str, Table]:
+def read_tables(
+    header: Header, data: UInt8, path: Path, wanted: tuple[str, ...]
+) -> dict[str, Table]:
     """Find every element's rows, and check that the body ends where they end.
 
     Parameters
@@ -123,15 +130,16 @@ def read_tables(header: Header, data: UInt8, path: Path, wanted: tuple[str, ...]
     here = header.size
     tables = {}
     for element in header.elements:
+        start = here
         if header.order:
             table = _binary(element, data, here, header.order, path)
             here = table.end
         else:
             table, here = _text(element, data, here, path, element.name in wanted)
-        tables[element.name] = table
+        tables[element.name] = replace(table, where=(start, here))
     rest = data[here:]
     # A few programs end a binary file with a line end.
-    if len(rest) > 2 and header.order or len(bytes(rest[: 1 << 16]).strip(b" \t\r\n\x1a")):
+    if (len(rest) > 2 and header.order) or len(bytes(rest[: 1 << 16]).strip(b" \t\r\n\x1a")):
         place = f"byte {here}" if header.order else _line_of(data, here)
         raise InputError(
             f"goes on for {len(rest)} bytes after the last of its elements.",
@@ -140,6 +148,42 @@ def read_tables(header: Header, data: UInt8, path: Path, wanted: tuple[str, ...]
             remedy="The counts in its header are too small; export it again.",
         )
     return {name: table for name, table in tables.items() if name in wanted}
+
+
+def scalar_columns(table: Table, names: tuple[str, ...], dtype: Any = None) -> NDArray[Any]:
+    """Decode several scalar columns into (rows, len(names)).
+
+    Parameters
+    ----------
+    table : Table
+    names : tuple of str
+        All present in the element.
+    dtype : dtype, optional
+        Else the type that holds all the file's.
+
+    Raises
+    ------
+    InputError
+        One of them is a list.
+    """
+    columns = []
+    for name in names:
+        number = table.element.column(name)
+        assert number is not None
+        counts, values = table.column(number)
+        if counts is not None:
+            raise InputError(
+                f"has {name!r} as a list.",
+                file=table.file,
+                place=f"element {table.element.name!r}",
+                remedy="Export it again.",
+            )
+        columns.append(values)
+    kind = dtype or np.result_type(*columns)
+    out = np.empty((table.element.count, len(names)), kind)
+    for k, column in enumerate(columns):
+        out[:, k] = column
+    return out
 
 
 def _layout(element: Element, text: bool) -> NDArray[np.int64]:
@@ -180,10 +224,7 @@ def _measured(table: Table, limit: int, lengths: NDArray[np.int64]) -> Table:
     element = table.element
     row = _alike(table, limit, lengths)
     if row is not None:
-        end = table.start + element.count * row.itemsize
-        return Table(
-            element, table.data, table.start, end, table.order, table.tokens, row, _NO_INTS, table.file
-        )
+        return replace(table, end=table.start + element.count * row.itemsize, row=row)
     from meshreg.io.ply_kernels import walk
 
     span = (table.start, limit, element.count)
@@ -192,9 +233,7 @@ def _measured(table: Table, limit: int, lengths: NDArray[np.int64]) -> Table:
     status, at, here, values = walk(table.data, table.tokens, span, layout, big, lengths)
     if status < 0:
         raise _broken(table, int(status), int(at), int(here), limit)
-    return Table(
-        element, table.data, table.start, int(status), table.order, table.tokens, None, values, table.file
-    )
+    return replace(table, end=int(status), values=values)
 
 
 def _alike(table: Table, limit: int, lengths: NDArray[np.int64]) -> np.dtype[Any] | None:
@@ -248,7 +287,8 @@ def _broken(table: Table, status: int, row: int, here: int, limit: int) -> Input
 def _line_of(data: UInt8, here: int) -> str:
     """Return "line N" of a byte; lines end with LF, CRLF or CR."""
     text = bytes(data[:here])
-    return f"line {text.count(b'\n') + text.count(b'\r') - text.count(b'\r\n') + 1}"
+    ends = text.count(b"\n") + text.count(b"\r") - text.count(b"\r\n")
+    return f"line {ends + 1}"
 
 
 def _text(element: Element, data: UInt8, start: int, path: Path, wanted: bool) -> tuple[Table, int]:

@@ -128,7 +128,9 @@ def read_header(path: Path) -> Header:
             case ["property", *rest] if drafts:
                 drafts[-1][3].append(_property(rest, number, drafts[-1][3], path, place))
             case _:
-                raise _bad(f"has a line that means nothing here: {' '.join(words)[:80]!r}", path, place)
+                raise _bad(
+                    f"has a line that means nothing here: {' '.join(words)[:80]!r}", path, place
+                )
     if order is None:
         raise _bad("states no format", path, "header")
     elements = tuple(Element(name, n, tuple(items), at) for name, n, at, items in drafts)

@@ -16,13 +16,13 @@ CUT_OFF, BAD_COUNT, ROW_LENGTH = -1, -2, -3
 
 
 @jit(nogil=True)
-def _count_at(data: Any, tokens: Any, here: int, code: int, big: bool) -> int:
+def _count_at(data: Any, tokens: Any, here: int, code: int, big: bool) -> Any:
     """Read a list's count; -1 for a negative one or no whole number."""
     if code == 7:
         value = tokens[here >> 3]
         return np.int64(value) if 0 <= value <= 4294967295 and value == np.floor(value) else -1
     size = 1 if code <= 2 else (2 if code <= 4 else 4)
-    count = 0
+    count = np.int64(0)
     for k in range(size):
         count = count << 8 | np.int64(data[here + (k if big else size - 1 - k)])
     if code % 2 == 1 and count >> (8 * size - 1):
@@ -114,6 +114,16 @@ def gather(
 
 
 @jit(nogil=True)
+def _is_blank(byte: int) -> bool:
+    return byte in (32, 9)
+
+
+@jit(nogil=True)
+def _is_end(byte: int) -> bool:
+    return byte in (10, 13)
+
+
+@jit(nogil=True)
 def count_tokens(data: Any, start: int, rows: int, counts: Any) -> tuple[int, int]:
     """Count the words of the next `rows` lines that are not blank.
 
@@ -140,9 +150,9 @@ def count_tokens(data: Any, start: int, rows: int, counts: Any) -> tuple[int, in
         while here < len(data):
             byte = data[here]
             here += 1
-            if byte == 10 or byte == 13:
+            if _is_end(byte):
                 break
-            blank = byte == 32 or byte == 9
+            blank = _is_blank(byte)
             if not blank and not inside:
                 words += 1
             inside = not blank
@@ -168,13 +178,13 @@ def parse_tokens(data: Any, span: Any, out: Any, first: int) -> tuple[int, int, 
     here, end = span
     while here < end:
         byte = data[here]
-        if byte == 32 or byte == 9 or byte == 10 or byte == 13:
+        if _is_blank(byte) or _is_end(byte):
             here += 1
             continue
         begin = here
         while here < end:
             byte = data[here]
-            if byte == 32 or byte == 9 or byte == 10 or byte == 13:
+            if _is_blank(byte) or _is_end(byte):
                 break
             here += 1
         value, known = parse_number(data, begin, here)

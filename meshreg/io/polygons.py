@@ -165,14 +165,17 @@ def usable_faces(
 
     key, flat, lost = face_keys(points, np.ascontiguousarray(faces))
     keep = ~(flat | lost)
-    order = np.argsort(key, kind="stable")
-    same = np.flatnonzero(key[order[1:]] == key[order[:-1]])
-    first, again = order[same], order[same + 1]
-    # Equal keys are only candidates: the key is a hash where there are over 2^21 vertices.
-    equal = (np.sort(faces[first], axis=1) == np.sort(faces[again], axis=1)).all(axis=1)
-    again = again[equal]
-    copies = int(keep[again].sum())
-    keep[again] = False
+    copies = 0
+    ordered = np.sort(key)  # ten times faster than argsort, and mostly enough
+    if (ordered[1:] == ordered[:-1]).any():
+        order = np.argsort(key, kind="stable")
+        same = np.flatnonzero(key[order[1:]] == key[order[:-1]])
+        first, again = order[same], order[same + 1]
+        # Equal keys are only candidates: the key is a hash where there are over 2^21 vertices.
+        equal = (np.sort(faces[first], axis=1) == np.sort(faces[again], axis=1)).all(axis=1)
+        again = again[equal]
+        copies = int(keep[again].sum())
+        keep[again] = False
     notes = []
     if lost.any():
         notes.append(f"{int(lost.sum())} faces touch a vertex that is not finite and were dropped.")

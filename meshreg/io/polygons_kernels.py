@@ -10,7 +10,7 @@ from meshreg.jit import jit
 
 
 @jit(nogil=True)
-def _turn(a: Any, b: Any, c: Any) -> float:
+def _turn(a: Any, b: Any, c: Any) -> Any:
     """Twice the signed area of the triangle a, b, c in the plane; positive to the left."""
     return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
 
@@ -32,9 +32,9 @@ def _flatten(points: Any, vertex: Any, first: int, size: int) -> Any:
         for axis in range(3):
             i, j = (axis + 1) % 3, (axis + 2) % 3
             normal[axis] += (p[i] - o[i]) * (q[j] - o[j]) - (p[j] - o[j]) * (q[i] - o[i])
-    axis = np.argmax(np.abs(normal))
-    i, j = (axis + 1) % 3, (axis + 2) % 3
-    if normal[axis] < 0:
+    main: Any = np.argmax(np.abs(normal))
+    i, j = (main + 1) % 3, (main + 2) % 3
+    if normal[main] < 0:
         i, j = j, i
     flat = np.empty((size, 2))
     length = np.sqrt((normal * normal).sum())
@@ -56,10 +56,10 @@ def _is_convex(flat: Any) -> bool:
         if _turn(flat[k - 1], flat[k], flat[(k + 1) % size]) < 0:
             return False
     # Left turns only, but more than once around: a star is not convex.
+    around = True
     for k in range(1, size - 1):
-        if _turn(flat[0], flat[k], flat[k + 1]) < 0:
-            return False
-    return True
+        around = around and _turn(flat[0], flat[k], flat[k + 1]) >= 0
+    return around
 
 
 @jit(nogil=True)
@@ -194,6 +194,6 @@ def face_keys(points: Any, faces: Any) -> Any:
             area += part * part
         if not np.isfinite(total):
             lost[row] = True
-        elif low == middle or middle == high or area == 0.0:
+        elif middle in (low, high) or area == 0.0:
             flat[row] = True
     return key, flat, lost

@@ -114,9 +114,7 @@ def search_radius(settings: Settings, dem_cell: float) -> float:
     return 10.0 * max(1.0, dem_cell / 0.10)
 
 
-def _terrain(
-    reference: SurveyRaster, moving: SurveyRaster, settings: Settings
-) -> OffsetEstimate:
+def _terrain(reference: SurveyRaster, moving: SurveyRaster, settings: Settings) -> OffsetEstimate:
     from meshreg.offsets import terrain
 
     for raster, which in ((reference, "reference"), (moving, "moving")):
@@ -135,7 +133,7 @@ def _mutual_information(
     reason = _no_image(reference, moving)
     if reason:
         return failed("mutual_information", reason)
-    radius = search_radius(settings, 2 * reference.grid.cell)
+    radius = search_radius(settings, reference.grid.cell)
     window = Window.around(reference.grid, moving.grid, radius)
     return _exhaustive(
         "mutual_information", mutual_information.scan, reference, moving, settings, window
@@ -204,7 +202,6 @@ def _sift(reference: SurveyRaster, moving: SurveyRaster, settings: Settings) -> 
     if reason:
         return failed("sift", reason)
     options = settings.sift
-    # the radius follows the image's own cell only where that is coarser than a mosaic should be
     radius = search_radius(settings, reference.grid.cell)
     consensus, evidence = sift.match(reference, moving, settings, radius)
     total = len(evidence["inliers"])
@@ -223,10 +220,11 @@ def _sift(reference: SurveyRaster, moving: SurveyRaster, settings: Settings) -> 
     if max(abs(consensus.east), abs(consensus.north)) > radius:
         where = f"({consensus.east:.2f}, {consensus.north:.2f}) m"
         return failed("sift", f"the consensus {where} is outside the search radius", evidence)
+    by_chance = consensus.false_alarms > options.max_false_alarms
     return OffsetEstimate(
         "sift",
-        "ok",
-        "",
+        "weak" if by_chance else "ok",
+        "chance alone would bring as many matches together" if by_chance else "",
         consensus.east,
         consensus.north,
         sift.spread(offsets, places),

@@ -25,7 +25,7 @@ def smooth(field: Float64, mask: Bool, sigma: float) -> Float64:
 
     weight = gaussian_filter(mask.astype(np.float64), sigma, mode="constant", truncate=3.0)
     total = gaussian_filter(np.where(mask, field, 0.0), sigma, mode="constant", truncate=3.0)
-    return np.divide(total, weight, out=np.zeros_like(total), where=weight > 1e-6)
+    return np.asarray(np.divide(total, weight, out=np.zeros_like(total), where=weight > 1e-6))
 
 
 def high_pass(field: Float64, mask: Bool, sigma: float) -> Float64:
@@ -68,13 +68,15 @@ def orientation(
     length2 = d_row**2 + d_col**2
     edge = 0.5 * float(np.median(np.sqrt(length2[inner]))) if inner.any() else 1.0
     squashed = length2 + max(edge, 1e-12) ** 2
+    parts: tuple[Float64, ...]
     if signed:
         parts = (d_row / np.sqrt(squashed), d_col / np.sqrt(squashed))
     else:
         parts = ((d_col**2 - d_row**2) / squashed, 2 * d_row * d_col / squashed)
     # the mean direction of a whole raster (ripples, a strobe's side) says nothing of an offset
-    parts = tuple(np.where(inner, part - part[inner].mean(), 0.0) if inner.any() else part
-                  for part in parts)
+    parts = tuple(
+        np.where(inner, part - part[inner].mean(), 0.0) if inner.any() else part for part in parts
+    )
     return parts, inner
 
 

@@ -34,7 +34,7 @@ class Window:
         Shifts `s` of the moving raster's first row and column in the reference raster.
     east, north : (L,), (K,) float64
         The offsets [m] that they mean: what is added to moving coordinates.
-    shape : pair of pairs
+    shapes : pair of pairs
         Shapes of the reference and the moving raster.
     """
 
@@ -74,8 +74,8 @@ class Window:
             cell,
             steps + round(row),
             steps + round(col),
-            steps * cell,
-            -steps * cell,
+            np.asarray(steps * cell, np.float64),
+            np.asarray(-steps * cell, np.float64),
             (reference.shape, moving.shape),
         )
 
@@ -124,6 +124,6 @@ class Correlator:
 
 
 def overlap_floor(counts: Float64, share: float) -> Bool:
-    """Return where the overlap is large enough to be scored: `share` of the largest in the window."""
+    """Return where the overlap is scored: at least `share` of the largest in the window."""
     largest = float(counts.max()) if counts.size else 0.0
     return np.asarray(counts >= max(share * largest, 1.0))

@@ -13,7 +13,7 @@ from meshreg.jit import jit, prange
 def direct_information(
     first: Any, second: Any, rows: Any, cols: Any, scored: Any, bins: int
 ) -> Any:
-    """Mutual information (nat) of two level images for each offset; levels under 0 are masked."""
+    """Mutual information (nat) of two level images for each offset; level `bins` is masked."""
     surface = np.zeros((len(rows), len(cols)))
     height1, width1 = first.shape
     height2, width2 = second.shape
@@ -57,4 +57,4 @@ def _information(joint: Any, bins: int) -> float:
             marginal_sum += marginal[b] * np.log(marginal[b])
     if total == 0:
         return 0.0
-    return (joint_sum - marginal_sum) / total + np.log(total)
+    return float((joint_sum - marginal_sum) / total + np.log(total))

@@ -75,8 +75,8 @@ def direct_surface(
     correlator = Correlator(window)
     counts = correlator.counts(*(correlator.transform(mask) for mask in masks))
     scored = overlap_floor(counts, min_overlap)
-    a = np.where(masks[0], first, -1).astype(np.int16)
-    b = np.where(masks[1], second, -1).astype(np.int16)
+    a = np.where(masks[0], first.astype(np.int16), bins)
+    b = np.where(masks[1], second.astype(np.int16), bins)
     surface = direct_information(a, b, window.rows, window.cols, scored, bins)
     return np.where(scored, surface, np.nan), counts
 
@@ -130,5 +130,3 @@ def _n_log_n(counts: Float64) -> Float64:
     from scipy.special import xlogy
 
     return np.asarray(xlogy(counts, counts))
-
-

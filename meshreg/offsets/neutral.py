@@ -105,8 +105,13 @@ def turned_grid(grid: Grid, turn: int) -> Grid:
         return grid
     rows, cols = grid.shape
     shift = (cols - rows) // 2
-    return Grid(grid.west + shift * grid.cell, grid.north + shift * grid.cell, grid.cell,
-                (cols, rows), grid.crs)
+    return Grid(
+        grid.west + shift * grid.cell,
+        grid.north + shift * grid.cell,
+        grid.cell,
+        (cols, rows),
+        grid.crs,
+    )
 
 
 def _power(field: Field) -> Float64:

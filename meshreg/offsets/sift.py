@@ -83,13 +83,18 @@ def features(raster: SurveyRaster, options: SiftSettings, equalise: bool) -> tup
     image = _eight_bit(grey(raster), mask, equalise)
     inside = cv2.erode(mask.astype(np.uint8), np.ones((9, 9), np.uint8), borderValue=0)
     share = options.max_features * options.tile**2 / max(int(mask.sum()), options.tile**2)
-    sift = cv2.SIFT_create(nfeatures=max(int(share), 500))
+    sift = cv2.SIFT_create(  # type: ignore[attr-defined]
+        nfeatures=max(int(share), 500)
+    )
     rows_cols, descriptors, strength = [], [], []
     height, width = image.shape
     for top in range(0, height, options.tile):
         for left in range(0, width, options.tile):
             y0, x0 = max(top - MARGIN, 0), max(left - MARGIN, 0)
-            y1, x1 = min(top + options.tile + MARGIN, height), min(left + options.tile + MARGIN, width)
+            y1, x1 = (
+                min(top + options.tile + MARGIN, height),
+                min(left + options.tile + MARGIN, width),
+            )
             core = np.zeros((y1 - y0, x1 - x0), np.uint8)
             core[top - y0 : top - y0 + options.tile, left - x0 : left - x0 + options.tile] = 1
             core &= inside[y0:y1, x0:x1]
@@ -142,9 +147,7 @@ def draws(options: SiftSettings) -> int:
     return math.ceil(math.log(1 - options.confidence) / math.log(1 - clean))
 
 
-def ransac(
-    offsets: Float64, options: SiftSettings, rng: np.random.Generator
-) -> Consensus | None:
+def ransac(offsets: Float64, options: SiftSettings, rng: np.random.Generator) -> Consensus | None:
     """III-B as published: means of ten random matches, the one with most inliers wins."""
     n_matches = len(offsets)
     if n_matches < options.sample:
@@ -158,7 +161,9 @@ def ransac(
             best, best_inliers = int(inliers.sum()), inliers
     if best < 1:
         return None
-    return _consensus(offsets, best_inliers, options.inlier_radius, np.ptp(offsets, axis=0).max() / 2)
+    return _consensus(
+        offsets, best_inliers, options.inlier_radius, np.ptp(offsets, axis=0).max() / 2
+    )
 
 
 def vote(offsets: Float64, inlier_radius: float, search_radius: float) -> Consensus | None:

@@ -75,9 +75,7 @@ def cost_surface(
     mean1, mean2 = correlator.sums((z1, m2)) / n, correlator.sums((m1, z2)) / n
     square1, square2 = correlator.sums((q1, m2)) / n, correlator.sums((m1, q2)) / n
     cross = correlator.sums((z1, z2)) / n
-    spread = np.sqrt(
-        np.maximum(square1 - mean1**2, 0.0) * np.maximum(square2 - mean2**2, 0.0)
-    )
+    spread = np.sqrt(np.maximum(square1 - mean1**2, 0.0) * np.maximum(square2 - mean2**2, 0.0))
     scored = overlap_floor(counts, min_overlap) & (spread >= FLAT)
     cost = np.full(counts.shape, np.nan)
     np.divide(square1 + square2 - 2 * cross, spread, out=cost, where=scored)
@@ -110,9 +108,7 @@ def correlation_surface(
     return np.where(scored, total / len(scales), np.nan), counts
 
 
-def absolute_heights(
-    reference: SurveyRaster, moving: SurveyRaster
-) -> tuple[Float64, Float64]:
+def absolute_heights(reference: SurveyRaster, moving: SurveyRaster) -> tuple[Float64, Float64]:
     """Heights [m] of both less one common constant (never one each: it would hide their bias)."""
     constant = reference.datum
     if reference.valid.any():

@@ -1,0 +1,136 @@
+"""Light and water between the seafloor and the mosaic, per texel."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from data_synth.noise_kernels import gradient_noise, hash01, octaves
+from meshreg.jit import jit, prange
+
+
+@jit(nogil=True)
+def nearest_camera(x, y, plan):
+    """Return offset from the camera whose image was used here, its number pair and altitude.
+
+    Cameras stand on a lattice of tracks and exposures, strewn by navigation; the mosaic takes
+    each texel from the nearest one.
+    """
+    c, s = math.cos(plan.heading), math.sin(plan.heading)
+    along, across = (c * x + s * y) / plan.image_spacing, (c * y - s * x) / plan.track_spacing
+    stray = plan.seam_noise * gradient_noise(x * 3.0, y * 3.0, plan.seed + 1)
+    across += stray
+    along += plan.seam_noise * gradient_noise(x * 3.0, y * 3.0, plan.seed + 2)
+    ia, ic = math.floor(along), math.floor(across)
+    best, dx, dy, na, nc = 1e30, 0.0, 0.0, 0, 0
+    for j in range(-1, 2):
+        for i in range(-1, 2):
+            ca = ia + i + 0.5 + 0.5 * (hash01(ia + i, ic + j, plan.seed + 3) - 0.5)
+            cc = ic + j + 0.5 + 0.35 * (hash01(ia + i, ic + j, plan.seed + 4) - 0.5)
+            da, dc = (along - ca) * plan.image_spacing, (across - cc) * plan.track_spacing
+            d2 = da * da + dc * dc
+            if d2 < best:
+                best, dx, dy, na, nc = d2, da, dc, ia + i, ic + j
+    high = plan.altitude * (1.0 + 0.10 * (hash01(na, nc, plan.seed + 5) - 0.5))
+    high *= 1.0 + 0.06 * gradient_noise(0.4 * na, 3.7 * nc, plan.seed + 6)
+    return dx, dy, na, nc, high
+
+
+@jit(parallel=True, nogil=True)
+def radiance(z, soft, albedo, step, west, north, mirror, plan):
+    """Linear colour (H, W, 3) f32 that the cameras saw of a lattice of the seafloor.
+
+    Parameters
+    ----------
+    z, soft : (H, W) f32
+        Height [m] and its local mean, for the dimness of crevices.
+    albedo : (H, W, 3) f32
+    step, west, north : float
+        Spacing and first sample's centre in the survey's centred frame [m].
+    mirror : float
+        -1 where the lattice's columns run westward in the world, else 1.
+    plan : Plan
+    """
+    rows, cols = z.shape
+    out = np.empty((rows, cols, 3), np.float32)
+    sun_x, sun_y = math.sin(plan.azimuth), math.cos(plan.azimuth)
+    lie, rise = math.cos(plan.elevation), math.sin(plan.elevation)
+    attenuation = (plan.attenuation_red, plan.attenuation_green, plan.attenuation_blue)
+    haze = (plan.haze_red, plan.haze_green, plan.haze_blue)
+    c, s = math.cos(plan.heading), math.sin(plan.heading)
+    for i in prange(rows):
+        up, down = max(i - 1, 0), min(i + 1, rows - 1)
+        y = north - i * step
+        for j in range(cols):
+            left, right = max(j - 1, 0), min(j + 1, cols - 1)
+            gx = (z[i, right] - z[i, left]) / ((right - left) * step)
+            gy = (z[up, j] - z[down, j]) / ((down - up) * step)
+            norm = 1.0 / math.sqrt(1.0 + gx * gx + gy * gy)
+            x = west + j * step
+            da, dc, na, nc, high = nearest_camera(x, y, plan)
+            # crevices see less of the sky
+            open_sky = 1.0 + plan.crevice * (z[i, j] - soft[i, j])
+            open_sky = min(1.15, max(0.30, open_sky)) * (0.55 + 0.45 * norm)
+            sun = max(0.0, (rise - lie * (gx * sun_x * mirror + gy * sun_y)) * norm)
+            light = plan.ambient * open_sky + plan.sun * sun * min(1.0, open_sky + 0.1)
+            if plan.caustics > 0.0:
+                salt = plan.seed + 31 * na + 17 * nc
+                a = abs(gradient_noise(x * 5.0, y * 5.0, salt))
+                b = abs(gradient_noise(x * 7.7 + 3.0, y * 7.7, salt + 9))
+                light *= 1.0 + plan.caustics * (1.5 * math.exp(-22.0 * min(a, b)) - 0.45)
+            if plan.strobe > 0.0:
+                # a pair of strobes fore and aft of the camera, the fore one stronger
+                flash = 0.0
+                for k in range(2):
+                    arm = plan.strobe_arm if k == 0 else -plan.strobe_arm
+                    la, lc, lz = arm - da, 0.25 * arm - dc, high - (z[i, j] - soft[i, j])
+                    ex, ey = c * la - s * lc, s * la + c * lc
+                    far = math.sqrt(la * la + lc * lc + lz * lz)
+                    face = (lz - gx * ex - gy * ey) * norm / far
+                    beam = (lz / far) ** 4
+                    power = 1.0 if k == 0 else plan.strobe_balance
+                    flash += power * max(0.0, face) * beam * (high / far) ** 2
+                light += plan.strobe * flash * min(1.0, open_sky + 0.15)
+            view = math.sqrt(da * da + dc * dc + high * high)
+            edge = (high / view) ** (4.0 * plan.vignette)
+            gain = 1.0 + plan.seams * (2.0 * hash01(na, nc, plan.seed + 7) - 1.0)
+            path = view - plan.altitude * plan.corrected
+            for k in range(3):
+                clear = math.exp(-attenuation[k] * path)
+                veil = haze[k] * (1.0 - math.exp(-attenuation[k] * view))
+                tint = 1.0 + 0.5 * plan.seams * (hash01(na, nc, plan.seed + 8 + k) - 0.5)
+                out[i, j, k] = (albedo[i, j, k] * light * clear + veil) * gain * edge * tint
+    return out
+
+
+@jit(parallel=True, nogil=True)
+def encode(linear, scale, gamma, noise, seed, west, north, step):
+    """Linear colour to 8 bits: exposure per channel `scale` (3,), gamma, sensor noise [counts]."""
+    rows, cols, _ = linear.shape
+    out = np.empty((rows, cols, 3), np.uint8)
+    first_row, first_col = math.floor(-north / step), math.floor(west / step)
+    for i in prange(rows):
+        for j in range(cols):
+            grey = hash01(first_col + j, first_row + i, seed) + hash01(
+                first_col + j, first_row + i, seed + 1
+            )
+            grey = noise * 2.4 * (grey - 1.0)
+            for k in range(3):
+                value = max(0.0, linear[i, j, k] * scale[k])
+                if value > 0.8:  # the film's shoulder
+                    value = 0.8 + 0.2 * (1.0 - math.exp(-(value - 0.8) / 0.2))
+                own = noise * 1.7 * (hash01(first_col + j, first_row + i, seed + 2 + k) - 0.5)
+                out[i, j, k] = np.uint8(
+                    min(255.0, max(0.0, 255.0 * value ** (1.0 / gamma) + grey + own + 0.5))
+                )
+    return out
+
+
+@jit(parallel=True, nogil=True)
+def blotches(x, y, seed, wavelength, count):
+    """Noise of standard deviation about 1 at points (N,), for holes, edges and height noise."""
+    out = np.empty(x.size)
+    for i in prange(x.size):
+        out[i] = octaves(x[i], y[i], seed, wavelength, 0.0, 0.65, count)
+    return out

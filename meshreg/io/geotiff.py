@@ -1,0 +1,164 @@
+"""Open GeoTIFFs, and nothing that only claims to be one; say where their pixels lie.
+
+GDAL has 150 drivers and follows references between files; here it gets one driver, no look at the
+folder, and only files that start as a TIFF does.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from meshreg.errors import InputError, ResourceLimitError
+from meshreg.io.crs import crs_text, mend_proj_data
+from meshreg.io.safe import open_regular
+from meshreg.types import Float64
+
+MAGIC = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+_WINDOW = 1 << 24  # pixels decoded at once
+_DENSEST = 5000  # pixels that one byte of a compressed file may stand for
+_WORLD_FILES = (".tfw", ".TFW", ".tifw", ".tiffw", ".wld")
+EXPORT = "Export it as a GeoTIFF again."
+
+
+@contextmanager
+def environment() -> Iterator[None]:
+    """Keep GDAL from looking at other files, and PROJ from a broken database."""
+    mend_proj_data()
+    import rasterio
+
+    with rasterio.Env(GDAL_DISABLE_READDIR_ON_OPEN="EMPTY_DIR", GDAL_PAM_ENABLED="NO"):
+        yield
+
+
+@contextmanager
+def opened(path: Path, max_pixels: int) -> Iterator[Any]:
+    """Give the rasterio dataset of a GeoTIFF; what goes wrong inside becomes an InputError.
+
+    Raises
+    ------
+    InputError
+        Not a TIFF by its first bytes (a VRT in disguise, for one), or damaged.
+    ResourceLimitError
+        More than `max_pixels`.
+    """
+    with open_regular(path) as stream:
+        magic = stream.read(4)
+    if magic not in MAGIC:
+        raise InputError(f"is not a TIFF: it starts with {magic!r}.", file=path, remedy=EXPORT)
+    with environment():
+        import rasterio
+        from rasterio.errors import NotGeoreferencedWarning, RasterioError
+
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", NotGeoreferencedWarning)
+                dataset = rasterio.open(path.resolve(), driver="GTiff", sharing=False)
+            with dataset:
+                _check_size(dataset, path, max_pixels)
+                yield dataset
+        except RasterioError as error:
+            cause = error.__cause__ or error
+            raise InputError(
+                f"cannot be read: {_first_line(cause)}.",
+                file=path,
+                remedy="The file is cut off or damaged; export or copy it again.",
+            ) from error
+
+
+def _first_line(error: BaseException) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0].rstrip(".")
+
+
+def _check_size(dataset: Any, path: Path, max_pixels: int) -> None:
+    pixels = dataset.width * dataset.height
+    if pixels > max_pixels:
+        raise ResourceLimitError(
+            f"has {dataset.width} × {dataset.height} pixels; {max_pixels} are the limit.",
+            file=path,
+            remedy="Cut it, or raise the limit (max_pixels).",
+        )
+    size = path.stat().st_size
+    if pixels > size * _DENSEST:
+        raise InputError(
+            f"declares {dataset.width} × {dataset.height} pixels, but has {size} bytes.",
+            file=path,
+            remedy="The file is cut off or damaged; export or copy it again.",
+        )
+
+
+def is_picture(path: Path, max_pixels: int) -> bool:
+    """Whether a GeoTIFF is an orthomosaic: three bands or more, or whole numbers with a palette."""
+    with opened(path, max_pixels) as dataset:
+        colors = [i.name for i in dataset.colorinterp if i.name not in ("alpha", "undefined")]
+        whole = np.dtype(dataset.dtypes[0]).kind == "u"
+        return dataset.count >= 3 or "palette" in colors or (whole and dataset.dtypes[0] == "uint8")
+
+
+def windows(dataset: Any) -> Iterator[Any]:
+    """Give windows of whole rows, block-aligned, that cover the raster."""
+    from rasterio.windows import Window
+
+    step = max(1, _WINDOW // (dataset.width * dataset.count))
+    block = dataset.block_shapes[0][0]
+    step = max(step // block, 1) * block
+    for row in range(0, dataset.height, step):
+        yield Window(0, row, dataset.width, min(step, dataset.height - row))
+
+
+def lattice(dataset: Any, path: Path) -> Float64:
+    """Return the (2, 3) matrix from (col, row, 1) of outer pixel corners to file x, y.
+
+    A file whose pixels are points (AREA_OR_POINT=Point) is given by GDAL as areas already, half a
+    pixel outward of its tie point. Without georeference in the file, a world file beside it counts.
+    """
+    affine = dataset.transform
+    matrix = np.array([[affine.a, affine.b, affine.c], [affine.d, affine.e, affine.f]], float)
+    if affine.is_identity:
+        world = next(
+            (path.with_suffix(s) for s in _WORLD_FILES if path.with_suffix(s).is_file()), None
+        )
+        if world is None:
+            where = "ground control points only" if dataset.gcps[0] else "no georeference"
+            raise InputError(
+                f"has {where}: where its pixels lie is not known.",
+                file=path,
+                remedy="Export it as a GeoTIFF in a projected CRS, or with a world file (.tfw).",
+            )
+        matrix = _world_file(world)
+    if not np.isfinite(matrix).all() or not abs(np.linalg.det(matrix[:, :2])) > 0:
+        raise InputError(
+            f"has a georeference that flattens its pixels ({matrix.tolist()}).",
+            file=path,
+            remedy=EXPORT,
+        )
+    return matrix
+
+
+def _world_file(path: Path) -> Float64:
+    """Read six numbers: x and y steps by column, by row, and the CENTRE of the first pixel."""
+    with open_regular(path) as stream:
+        words = stream.read(4096).split()
+    try:
+        a, d, b, e, c, f = (float(word) for word in words[:6])
+    except ValueError as error:
+        raise InputError(
+            "is no world file: it should hold six numbers.", file=path, remedy=EXPORT
+        ) from error
+    return np.array([[a, b, c - (a + b) / 2], [d, e, f - (d + e) / 2]])
+
+
+def crs_of(dataset: Any, path: Path) -> str | None:
+    """Return the CRS of a dataset in the spelling of `crs_text`; None for a local one."""
+    if dataset.crs is None:
+        return None
+    wkt = dataset.crs.to_wkt()
+    try:
+        return crs_text(wkt)
+    except InputError as error:
+        raise InputError(error.message, file=path, remedy=error.remedy) from error

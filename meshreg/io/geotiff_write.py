@@ -1,0 +1,110 @@
+"""Write GeoTIFFs: cloud-optimised, whole or not at all, read back before they count."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from meshreg.errors import InputError, OutputError
+from meshreg.io.crs import parse_crs
+from meshreg.io.geotiff import environment, opened, windows
+from meshreg.io.safe import atomic_file
+from meshreg.types import Bool, Float32, Grid, UInt8
+
+log = logging.getLogger("meshreg")
+
+NODATA = -9999.0
+_RETURN = "Check free space and run again."
+
+
+def write_height(height: Float32, grid: Grid, path: Path) -> None:
+    """Write heights (H, W) float32 [m], NaN where there is none (-9999 in the file, declared).
+
+    Raises
+    ------
+    OutputError
+        It could not be written, or did not read back as written.
+    """
+    values = np.where(np.isfinite(height), height, np.float32(NODATA)).astype(np.float32)
+    if (height == NODATA).any():
+        log.warning("%s: heights of exactly %g become no data.", path, NODATA)
+    _write(values[None], grid, path, nodata=NODATA, units="metre")
+
+
+def write_color(color: UInt8, valid: Bool, grid: Grid, path: Path) -> None:
+    """Write colours (H, W, 3) uint8 with an alpha band that is 255 where `valid` (H, W), else 0.
+
+    Raises
+    ------
+    OutputError
+        It could not be written, or did not read back as written.
+    """
+    bands = np.empty((4, *valid.shape), np.uint8)
+    bands[:3] = np.moveaxis(color, 2, 0)
+    bands[3] = np.where(valid, 255, 0)
+    _write(bands, grid, path)
+
+
+def _write(
+    bands: NDArray[Any], grid: Grid, path: Path, nodata: float | None = None, units: str = ""
+) -> None:
+    from meshreg import __version__
+
+    with atomic_file(path) as temporary, environment():
+        import rasterio
+        from rasterio import Affine
+        from rasterio.crs import CRS
+        from rasterio.enums import ColorInterp
+        from rasterio.errors import RasterioError
+        from rasterio.io import MemoryFile  # noqa: F401  (registers drivers)
+
+        crs = None if grid.crs is None else CRS.from_wkt(parse_crs(grid.crs).to_wkt())
+        try:
+            with rasterio.open(
+                temporary,
+                "w",
+                driver="COG",
+                width=grid.shape[1],
+                height=grid.shape[0],
+                count=len(bands),
+                dtype=bands.dtype,
+                crs=crs,
+                transform=Affine(grid.cell, 0, grid.west, 0, -grid.cell, grid.north),
+                nodata=nodata,
+                compress="DEFLATE",
+                predictor="YES",
+                bigtiff="IF_SAFER",
+                overview_resampling="AVERAGE",
+            ) as dataset:
+                dataset.write(bands)
+                dataset.update_tags(AREA_OR_POINT="Area", TIFFTAG_SOFTWARE=f"meshreg {__version__}")
+                if len(bands) == 4:
+                    dataset.colorinterp = [
+                        ColorInterp.red,
+                        ColorInterp.green,
+                        ColorInterp.blue,
+                        ColorInterp.alpha,
+                    ]
+                if units:
+                    dataset.units = (units,) * len(bands)
+        except RasterioError as error:
+            raise OutputError(f"cannot be written: {error}.", file=path, remedy=_RETURN) from error
+        _check(bands, grid, temporary, path)
+
+
+def _check(bands: NDArray[Any], grid: Grid, temporary: Path, path: Path) -> None:
+    """Compare what is on disk with what was meant, value by value."""
+    try:
+        with opened(temporary, 1 << 62) as dataset:
+            same = dataset.shape == grid.shape and dataset.bounds == grid.bounds
+            for window in windows(dataset) if same else ():
+                rows = slice(window.row_off, window.row_off + window.height)
+                same = same and np.array_equal(dataset.read(window=window), bands[:, rows])
+    except InputError as error:
+        raise OutputError(error.message, file=path, remedy=_RETURN) from error
+    if not same:
+        raise OutputError("does not read back as written.", file=path, remedy=_RETURN)

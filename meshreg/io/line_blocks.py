@@ -1,0 +1,128 @@
+"""Whole lines of a text file, a block at a time, worked on side by side and given in order."""
+
+from __future__ import annotations
+
+import os
+from collections import deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, BinaryIO, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from meshreg.errors import InputError
+
+BLOCK = 1 << 20  # bytes read at once; also the longest line
+PADDING = b"\n\n\n\n"
+_MAX_THREADS = 4
+_Result = TypeVar("_Result")
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """Whole lines of a file: `data[:end]`, then `PADDING`; at most 2 * BLOCK bytes."""
+
+    data: NDArray[np.uint8]
+    end: int
+
+
+def line_blocks(stream: BinaryIO, path: Path, hasher: Any = None) -> Iterator[Block]:
+    """Cut a text file into blocks of whole lines (LF, CRLF or CR); refuse what is no text.
+
+    A byte order mark is dropped. A line end that a backslash hides does not end a block.
+
+    Parameters
+    ----------
+    stream : binary file at its start
+    path : Path
+        For messages.
+    hasher : optional
+        Its `update` gets every byte of the file, in order.
+
+    Raises
+    ------
+    InputError
+        UTF-16, a NUL byte, an empty file.
+    """
+    head = stream.read(3)
+    if not head:
+        raise InputError("is empty.", file=path, remedy="Export or copy it again.")
+    if head[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        raise InputError("is UTF-16 text.", file=path, remedy="Save it as UTF-8.")
+    if hasher is not None:
+        hasher.update(head)
+    carry = b"" if head == b"\xef\xbb\xbf" else head
+    place = len(head) - len(carry)  # of the carry's first byte in the file
+    n_read = -1
+    while n_read:
+        buffer = bytearray(len(carry) + BLOCK + len(PADDING))
+        buffer[: len(carry)] = carry
+        new = memoryview(buffer)[len(carry) : len(carry) + BLOCK]
+        n_read = stream.readinto(new)  # type: ignore[attr-defined]
+        if hasher is not None:
+            hasher.update(new[:n_read])
+        size = len(carry) + n_read
+        nul = buffer.find(b"\0", 0, size)
+        if nul >= 0:
+            raise InputError(
+                "holds a NUL byte: it is no text, or damaged.",
+                file=path,
+                place=f"byte {place + nul}",
+                remedy="Export or copy it again.",
+            )
+        end = _last_line_end(buffer, size) if n_read else size
+        if end == 0 and size >= BLOCK:
+            end = size  # a line too long to be one; who reads it says which
+        carry = bytes(memoryview(buffer)[end:size])
+        place += end
+        if end:
+            buffer[end : end + len(PADDING)] = PADDING
+            yield Block(np.frombuffer(buffer, np.uint8), end)
+
+
+def _last_line_end(buffer: bytearray, size: int) -> int:
+    """Return the place behind the last line that is whole, 0 if there is none."""
+    end = size
+    while end > 0:
+        newline, carriage = buffer.rfind(b"\n", 0, end), buffer.rfind(b"\r", 0, end)
+        last = max(newline, carriage)
+        # A carriage return at the very end may be half of a CRLF.
+        split = last == carriage and last == size - 1
+        before = last - (2 if last == newline and carriage == last - 1 else 1)
+        hidden = before >= 0 and buffer[before] == ord("\\")
+        if not split and not hidden:
+            return last + 1
+        end = last
+    return 0
+
+
+def in_order(
+    blocks: Iterator[Block], work: Callable[[Block], _Result], n_bytes: int
+) -> Iterator[tuple[Block, _Result]]:
+    """Work on blocks in threads; give blocks and results in the order of the file.
+
+    `work` must not depend on earlier blocks, and gains where it holds no lock. Small files
+    (`n_bytes`) are worked on at once.
+    """
+    threads = min(_MAX_THREADS, os.cpu_count() or 1)
+    if threads == 1 or n_bytes <= 2 * BLOCK:
+        for block in blocks:
+            yield block, work(block)
+        return
+    with ThreadPoolExecutor(threads) as pool:
+        waiting: deque[tuple[Block, Future[_Result]]] = deque()
+        try:
+            for block in blocks:
+                waiting.append((block, pool.submit(work, block)))
+                if len(waiting) > threads:
+                    first, result = waiting.popleft()
+                    yield first, result.result()
+            while waiting:
+                first, result = waiting.popleft()
+                yield first, result.result()
+        finally:
+            for _, result in waiting:
+                result.cancel()

@@ -1,0 +1,140 @@
+"""The verdict: right pairs accepted, wrong ones never."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import numpy as np
+import pytest
+import seafloor
+
+from meshreg.judge import TURN_NAMES, channel_map, judge
+from meshreg.offsets import estimate_offsets
+from meshreg.settings import Settings
+from meshreg.types import OffsetEstimate, SurveyRaster
+
+OFFSET = (1.237, -2.412)
+SETTINGS = Settings().changed({"methods": "terrain,mutual_information", "search.radius": 5.0})
+
+
+@functools.cache
+def pair(seed, change=0.4, **kind):
+    return seafloor.rasters(seed, OFFSET, change=change, half=7.0, size=20.0, **kind)
+
+
+def verdict(rasters, settings=SETTINGS):
+    estimates = estimate_offsets(rasters, settings)
+    return judge(estimates, rasters, settings, settings.search.radius)
+
+
+def swapped_moving(rasters, change):
+    return {name: (a, change(b)) for name, (a, b) in rasters.items()}
+
+
+@pytest.mark.parametrize("change", [0.0, 0.3, 0.6])
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_true_pairs_are_accepted_and_right(seed, change):
+    judged = verdict(pair(seed, change))
+    assert judged.verdict == "accepted", judged.reason
+    assert np.hypot(judged.best.east - OFFSET[0], judged.best.north - OFFSET[1]) < 0.06
+    assert judged.false_alarm < 1e-6
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_another_place_is_rejected(seed):
+    """Same footprint, depth and coordinates; only the seafloor differs."""
+    here, there = pair(seed), pair(seed + 100)
+    judged = verdict({name: (here[name][0], there[name][1]) for name in here})
+    assert judged.verdict == "rejected"
+    assert "stands out from chance" in judged.reason
+    assert judged.false_alarm > 1e-4
+
+
+def test_channels_that_contradict_are_reviewed():
+    """Terrain of one offset under an image of another: nothing to accept."""
+    rasters = dict(pair(4, 0.1))
+    reference, moving = rasters["ortho"]
+    grid = dataclasses.replace(moving.grid, west=moving.grid.west - 1.0)
+    rasters["ortho"] = (reference, dataclasses.replace(moving, grid=grid))
+    judged = verdict(rasters)
+    assert judged.verdict == "review"
+    assert "contradict" in judged.reason
+    assert len(judged.hypotheses) >= 2
+    # both are offered, 1 m apart
+    gap = judged.hypotheses[0].east - judged.hypotheses[1].east
+    assert abs(gap) == pytest.approx(1.0, abs=0.1)
+
+
+@pytest.mark.parametrize("name", ["mirrored east-west", "turned by 180°"])
+def test_mirrored_and_turned_surveys_are_named(name):
+    turn, flip = next(k for k, v in TURN_NAMES.items() if v == name)
+
+    def change(raster: SurveyRaster) -> SurveyRaster:
+        def turned(array):
+            array = np.rot90(array, turn)
+            return np.fliplr(array) if flip else array
+
+        return dataclasses.replace(raster, height=turned(raster.height), color=turned(raster.color))
+
+    judged = verdict(swapped_moving(pair(5, 0.1), change))
+    assert judged.verdict == "rejected"
+    assert name in judged.reason
+    assert "axes" in judged.reason
+
+
+def test_terrain_alone_may_be_overwhelming():
+    def grey(raster):
+        return dataclasses.replace(raster, color_valid=np.zeros(raster.grid.shape, bool))
+
+    rasters = {name: (grey(a), grey(b)) for name, (a, b) in pair(6, 0.2).items()}
+    judged = verdict(rasters)
+    assert judged.verdict == "accepted"
+    assert "overwhelming" in judged.reason
+    assert np.hypot(judged.best.east - OFFSET[0], judged.best.north - OFFSET[1]) < 0.06
+
+
+def test_periodic_ground_is_not_accepted_at_the_wrong_crest():
+    """Perfect ripples fit at every wavelength: no answer may be accepted."""
+
+    def rippled(raster: SurveyRaster, phase: float, seed: int) -> SurveyRaster:
+        rows, cols = raster.grid.shape
+        east, _ = raster.grid.east_north(0, np.arange(cols))
+        wave = np.sin(2 * np.pi * (east + phase) / 0.7)
+        rng = np.random.default_rng(seed)
+        height = 0.05 * wave[None, :] + rng.normal(0, 0.005, (rows, cols))
+        color = np.clip(110 + 40 * wave[None, :, None] + rng.normal(0, 4, (rows, cols, 3)), 0, 255)
+        return dataclasses.replace(raster, height=height, color=color.astype(np.uint8))
+
+    rasters = {name: (rippled(a, 0.0, 1), rippled(b, 0.3, 2)) for name, (a, b) in pair(7).items()}
+    assert verdict(rasters).verdict != "accepted"
+
+
+def test_a_wrong_candidate_does_not_win():
+    """A method that shouts a wrong offset is outvoted by the evidence."""
+    rasters = pair(1, 0.3)
+    shout = OffsetEstimate("sift", "ok", "", -3.0, 3.0, np.eye(2) * 1e-8, 1.0, 99.0)
+    judged = judge([shout], rasters, SETTINGS, 5.0)
+    assert judged.verdict == "accepted"
+    assert np.hypot(judged.best.east - OFFSET[0], judged.best.north - OFFSET[1]) < 0.06
+    assert "sift" not in judged.best.methods
+
+
+def test_small_overlap_is_not_accepted_silently():
+    reference, _ = pair(1)["dem"]
+    grid = dataclasses.replace(reference.grid, west=reference.grid.west + 200.0)
+    moving = dataclasses.replace(reference, grid=grid)
+    judged = judge([], {"dem": (reference, moving), "ortho": (reference, moving)}, SETTINGS, 5.0)
+    assert judged.verdict == "rejected"
+    assert "overlap" in judged.reason
+
+
+def test_null_gaps_are_exponential_in_their_scale():
+    """Over unrelated pairs, gap / null_gap exceeds x about as often as exp(-x)."""
+    ratios = []
+    for seed in range(12):
+        reference, other = pair(seed)["dem"][0], pair(seed + 50)["dem"][1]
+        found = channel_map(reference, other, "terrain", 5.0, 0.3)
+        ratios.append(found.peak.gap / found.null_gap)
+    assert 0.3 < np.mean(ratios) < 1.8
+    assert max(ratios) < 6

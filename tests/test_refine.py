@@ -1,0 +1,102 @@
+"""Tile offsets, yaw and covariance against a seafloor whose motion is known exactly."""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+import pytest
+import seafloor
+
+from meshreg.refine import TileOffsets, fit, refine
+
+OFFSET = (1.237, -2.412)
+
+
+@functools.cache
+def refined(seed, change, yaw_deg):
+    rasters = seafloor.rasters(
+        seed, OFFSET, yaw=np.deg2rad(yaw_deg), change=change, half=8.0, size=22.0
+    )
+    used = [(*rasters["dem"], "terrain"), (*rasters["ortho"], "image")]
+    return refine(used, (1.2, -2.45), np.eye(2) * 0.03**2, 0.25)
+
+
+def truth_at(pivot, yaw):
+    """Offset that lays `pivot` back where it came from: x = R(-yaw) (x' + offset)."""
+    c, s = np.cos(-yaw), np.sin(-yaw)
+    place = np.asarray(pivot) + OFFSET
+    return np.array([[c, -s], [s, c]]) @ place - pivot
+
+
+@pytest.mark.parametrize("yaw_deg", [0.0, 0.5, -0.8])
+@pytest.mark.parametrize("change", [0.0, 0.3])
+def test_offset_and_yaw(change, yaw_deg):
+    result = refined(3, change, yaw_deg)
+    yaw = np.deg2rad(yaw_deg)
+    error = result.offset - truth_at(result.pivot, yaw)
+    assert np.hypot(*error) < (0.006 if change == 0 else 0.012)
+    assert abs(np.rad2deg(result.yaw) + yaw_deg) < (0.01 if change == 0 else 0.1)
+
+
+def test_insignificant_yaw_is_left_at_zero():
+    assert refined(3, 0.3, 0.0).yaw == 0.0
+
+
+def test_swapped_pair_gives_the_inverse():
+    rasters = seafloor.rasters(4, OFFSET, yaw=np.deg2rad(0.5), change=0.2, half=8.0, size=22.0)
+    there = refine([(*rasters["dem"], "terrain")], (1.2, -2.45), np.eye(2) * 0.03**2, 0.25)
+    back = refine([(*rasters["dem"][::-1], "terrain")], (-1.2, 2.45), np.eye(2) * 0.03**2, 0.25)
+    sigma = np.sqrt(there.covariance[2, 2] + back.covariance[2, 2])
+    assert abs(there.yaw + back.yaw) < 3 * sigma
+    c, s = np.cos(there.yaw), np.sin(there.yaw)
+    place = np.array([2.0, 3.0])
+    rotate = np.array([[c, -s], [s, c]])
+    forth = there.pivot + there.offset + rotate @ (place - there.pivot)
+    home = back.pivot + back.offset + rotate.T @ (forth - back.pivot)
+    assert np.hypot(*(home - place)) < 0.02
+
+
+def test_fit_ignores_wild_tiles():
+    rng = np.random.default_rng(0)
+    places = rng.uniform(-10, 10, (40, 2))
+    pivot = places.mean(axis=0)
+    arm = places - pivot
+    offsets = np.array([0.3, -0.2]) + 0.006 * np.stack([-arm[:, 1], arm[:, 0]], axis=1)
+    offsets += rng.normal(0, 0.004, offsets.shape)
+    offsets[::5] += rng.uniform(0.2, 0.5, (8, 2))
+    tiles = TileOffsets(places, offsets, np.arange(40), np.zeros(40, int))
+    result = fit(tiles, pivot, yaw_free=True)
+    assert result.yaw == pytest.approx(0.006, abs=4e-4)
+    np.testing.assert_allclose(result.offset, [0.3, -0.2], atol=0.004)
+    assert (result.weights[::5] == 0).all()
+
+
+def test_covariance_is_the_scatter():
+    """The sandwich's sigma, over many draws, is what the answer scatters by."""
+    rng = np.random.default_rng(1)
+    places = np.stack(np.meshgrid(np.arange(6.0), np.arange(6.0)), axis=-1).reshape(-1, 2) * 3
+    pivot = places.mean(axis=0)
+    answers, stated = [], []
+    for _ in range(300):
+        offsets = rng.normal(0, 0.02, (36, 2))
+        both = TileOffsets(
+            np.concatenate([places, places]),
+            # the second channel errs exactly as the first: it must not halve the variance
+            np.concatenate([offsets, offsets]),
+            np.tile(np.arange(36), 2),
+            np.repeat([0, 1], 36),
+        )
+        result = fit(both, pivot, yaw_free=True)
+        answers.append([*result.offset, result.yaw])
+        stated.append(np.diag(result.covariance))
+    scatter, mean = np.var(np.array(answers), axis=0), np.mean(np.array(stated), axis=0)
+    assert np.all((mean / scatter > 0.6) & (mean / scatter < 1.5))
+
+
+def test_too_few_tiles_keep_the_judged_offset():
+    rasters = seafloor.rasters(5, (0.1, 0.0), change=0.2, half=2.0, size=10.0)
+    result = refine([(*rasters["dem"], "terrain")], (0.1, 0.0), np.eye(2) * 0.01**2, 0.25)
+    np.testing.assert_array_equal(result.offset, [0.1, 0.0])
+    assert result.yaw == 0.0
+    assert "too few tiles" in result.note
