@@ -67,7 +67,7 @@ def power_law(u: Float64, low: float, high: float, exponent: float) -> Float64:
 # radius from, to [m], size exponent, height over radius from, to, most stretch, outline's reach
 FORMS: dict[int, tuple[float, float, float, float, float, float, float]] = {
     t.BOULDER: (0.18, 1.30, 1.3, 0.55, 1.05, 2.2, 1.12),
-    t.MASSIVE: (0.06, 0.75, 1.6, 0.55, 0.95, 1.5, 1.17),
+    t.MASSIVE: (0.06, 1.00, 1.4, 0.55, 0.95, 1.5, 1.17),
     t.BRANCHING: (0.08, 0.60, 1.3, 0.45, 0.75, 1.5, 1.36),
     t.PLATE: (0.10, 0.80, 1.2, 0.25, 0.50, 1.4, 1.33),
     t.ENCRUSTING: (0.05, 0.35, 1.6, 0.05, 0.12, 2.2, 1.43),

@@ -171,7 +171,7 @@ def _kelp(f, dx, dy, finest):
 def _white(f, r, g, b, light):
     """Return the colour after bleaching: white with a trace of its own tint."""
     share = f.bleached
-    tone = 0.62 + 0.22 * light
+    tone = 0.40 + 0.26 * light
     return (
         r + share * (tone * 0.98 - r),
         g + share * (tone * 0.96 - g),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from data_synth.noise_kernels import gradient_noise, hash01, lumps, octaves, smoothstep
+from data_synth.noise_kernels import hash01, lumps, octaves, smoothstep
 from meshreg.jit import jit
 
 
@@ -28,12 +28,13 @@ def sand_height(x, y, ground, finest):
         long = ground.ripple_wavelength
         stray = octaves(x, y, ground.seed + 12, 14.0 * long, finest, 0.6, 3)
         phase = (c * x + s * y) / long + ground.ripple_wander * stray + ground.ripple_phase
-        # crests fork where the second train meets the first
-        fork = gradient_noise(x / (9.0 * long), y / (9.0 * long), ground.seed + 13)
+        # steep lee sides, and crests that die out and start anew where two trains meet
         angle = 2.0 * math.pi * phase
-        wave = math.sin(angle + 0.45 * math.sin(angle)) + 0.9 * fork * math.sin(
-            angle * 0.5 + 4.0 * fork
-        )
+        wave = math.sin(angle + 0.5 * math.sin(angle))
+        if ground.ripple_wander > 0.2:
+            other = 2.0 * math.pi * (1.13 * phase + 0.35 * (c * y - s * x) / long)
+            blend = smoothstep(-0.3, 0.5, octaves(x, y, ground.seed + 13, 12.0 * long, finest, 0.5, 2))
+            wave += blend * (math.sin(other + 0.5 * math.sin(other)) - wave)
         fade = min(1.0, (long - finest) / finest) if finest > 0 else 1.0
         patch = smoothstep(-1.2, 0.3, octaves(x, y, ground.seed + 14, 3.5, finest, 0.5, 2))
         z += 0.5 * ground.ripple * wave * fade * (0.25 + 0.75 * patch)
@@ -45,32 +46,36 @@ def sand_height(x, y, ground, finest):
 def rock_height(x, y, ground, finest):
     """Height of the rock [m], the shade of the lump here (0..1) and how much rubble covers it."""
     gain = 0.5**ground.hurst
-    wx = x + 0.06 * octaves(x, y, ground.seed + 1, 1.1, finest, 0.5, 2)
-    wy = y + 0.06 * octaves(x, y, ground.seed + 2, 1.1, finest, 0.5, 2)
+    wx = x + 0.035 * octaves(x, y, ground.seed + 1, 0.9, finest, 0.45, 2)
+    wy = y + 0.035 * octaves(x, y, ground.seed + 2, 0.9, finest, 0.45, 2)
     z = ground.relief * octaves(
         x, y, ground.seed + 3, ground.relief_wavelength, finest, gain, 5
     )
     if ground.step > 0.0:
-        high = octaves(wx, wy, ground.seed + 4, ground.step_wavelength, finest, 0.5, 3)
+        high = octaves(wx, wy, ground.seed + 4, ground.step_wavelength, finest, 0.42, 4)
         z += ground.step * (
-            smoothstep(-0.10, 0.10, high - ground.step_level)
-            + 0.4 * smoothstep(-0.08, 0.08, high - ground.step_level - 0.8)
+            smoothstep(-0.05, 0.05, high - ground.step_level)
+            + 0.6 * smoothstep(-0.05, 0.05, high - ground.step_level - 0.7)
         )
     shade = 0.5
     cell, tall = ground.lump_cell, ground.lump
-    presence = 0.65
-    for k in range(7):
-        if tall <= 0.0 or cell * 0.5 < finest or cell < 0.012:
+    presence = 0.55
+    rough = 1.0
+    for k in range(5):
+        if tall <= 0.0 or cell * 0.5 < finest:
             break
         turned = 1.7 * k + 0.4
         c, s = math.cos(turned), math.sin(turned)
         up, own = lumps(
             (c * wx - s * wy) / cell, (s * wx + c * wy) / cell, ground.seed + 20 + k, presence
         )
-        z += tall * up
+        z += tall * rough * up
         if up > 0.0 and k >= 1:
             shade = shade * 0.4 + own * 0.6
-        cell *= 0.46
+        if k == 1:  # some ground is smooth, some broken
+            calm = octaves(x, y, ground.seed + 7, 1.6, finest, 0.6, 3)
+            rough = ground.broken_least + (1.0 - ground.broken_least) * smoothstep(-1.2, 1.4, calm)
+        cell *= 0.42
         tall *= ground.lump_gain
         presence = 0.85
     cover = 0.0
@@ -88,7 +93,7 @@ def rock_height(x, y, ground, finest):
                     z += cover * 0.28 * size * up
                     if up > 0.0:
                         shade = shade * (1.0 - cover) + own * cover
-    z += ground.grit * octaves(x, y, ground.seed + 6, 0.20, finest, gain, 5)
+    z += ground.grit * rough * octaves(x, y, ground.seed + 6, 0.20, finest, gain, 5)
     return z, shade, cover
 
 
@@ -111,15 +116,15 @@ def rock_color(x, y, ground, shade, cover, finest):
     fine = _mixed(x, y, ground, 52, 0.055, finest, 3)
     grain = _mixed(x, y, ground, 53, 0.010, finest, 2)
     # bare limestone or basalt
-    light = 0.20 * (0.65 + 0.7 * shade) * (1.0 + 0.16 * fine + 0.14 * grain)
+    light = 0.17 * (0.50 + 0.95 * shade) * (1.0 + 0.14 * patch + 0.16 * fine + 0.14 * grain)
     r, g, b = light * ground.tone_red, light * ground.tone_green, light * ground.tone_blue
     # turf: olive to brown, darker, in patches with ragged edges
     t = ground.turf * smoothstep(-1.3, 0.9, 0.7 * zone + patch + 0.35 * fine + 1.6 * ground.turf - 0.6)
     hue = 0.5 + 0.25 * patch
-    low = 0.085 * (0.75 + 0.5 * shade) * (1.0 + 0.22 * fine + 0.20 * grain)
+    low = 0.080 * (0.65 + 0.7 * shade) * (1.0 + 0.22 * fine + 0.20 * grain)
     r += t * (low * (1.05 + 0.25 * hue) - r)
-    g += t * (low * (0.98 - 0.05 * hue) - g)
-    b += t * (low * (0.55 - 0.10 * hue) - b)
+    g += t * (low * (0.96 - 0.10 * hue) - g)
+    b += t * (low * (0.50 - 0.12 * hue) - b)
     # coralline algae: mauve and pink crusts with sharp borders
     pink = ground.coralline * smoothstep(0.55, 0.8, 0.5 * zone - 0.55 * patch + 0.45 * fine + 0.4 * (shade - 0.5))
     low = 0.20 * (1.0 + 0.15 * fine + 0.12 * grain)

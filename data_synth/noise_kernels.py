@@ -117,11 +117,12 @@ def lumps(x, y, seed, presence):
             scale = small / (1.0 + t * t)
             turn, side = (1.0 - t * t) * scale, 2.0 * t * scale
             a, b = turn * dx + side * dy, turn * dy - side * dx
-            stretch = 1.0 + 0.8 * np.float64((k >> np.uint32(16)) & np.uint32(0xFF)) / 256.0
+            stretch = 1.0 + 0.5 * np.float64((k >> np.uint32(16)) & np.uint32(0xFF)) / 256.0
             d2 = a * a + b * b * stretch * stretch
             if d2 < 1.0:
                 tall = 0.45 + 0.55 * np.float64(k >> np.uint32(24)) / 256.0
-                value = tall * np.sqrt(1.0 - d2) * (1.0 + 0.5 * d2)
+                rise = np.sqrt(1.0 - d2)
+                value = tall * (0.35 * rise + 0.65 * np.sqrt(rise))
                 if value > best:
                     best, own = value, np.float64(k & np.uint32(0xFFFF)) / 65536.0
     return best, own

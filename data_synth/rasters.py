@@ -53,8 +53,7 @@ def make_rasters(
     dem_cell, ortho_cell : float
         [m]
     step : float, optional
-        Spacing of the samples that are averaged [m]; by default a third of `ortho_cell`, not
-        finer than 0.008 m unless `ortho_cell` is.
+        Spacing of the samples that are averaged [m]; by default half of `ortho_cell`.
     """
     scene = make_scene(recipe, seed, size)
     rasters = []
@@ -68,7 +67,7 @@ def _take_rasters(
     take: Take, dem_cell: float, ortho_cell: float, step: float | None
 ) -> list[SurveyRaster]:
     times = dem_cell / ortho_cell
-    fine = max(ortho_cell / 3.0, min(0.008, ortho_cell)) if step is None else step
+    fine = ortho_cell / 2.0 if step is None else step
     per_cell = max(1, math.ceil(ortho_cell / fine - 1e-9))
     if abs(times - round(times)) > 1e-9 or times < 1:
         per_dem = max(1, math.ceil(dem_cell / fine - 1e-9))
@@ -100,17 +99,13 @@ def _sampled(take: Take, snap: float, step: float) -> Sampled:
         left * snap - start[0] + step / 2, high * snap - start[1] - step / 2, step, shape
     )
     up, color = take.sample(lattice)
-    e, n = np.meshgrid(lattice.east, lattice.norths)
-    coarse = max(1, round(0.04 / step))
-    kept = take.covered(e[::coarse, ::coarse], n[::coarse, ::coarse])
-    kept = np.repeat(np.repeat(kept, coarse, axis=0), coarse, axis=1)[: shape[0], : shape[1]]
+    kept = take.margin_lattice(lattice) > 0
     up32 = up.astype(np.float32)
     sigma = take.sfm.smoothing * take.sfm.mesh_spacing / step
     if sigma > 0.3:
         up32 = cv2.GaussianBlur(up32, (0, 0), sigma)
     if take.sfm.vertex_noise > 0:
-        noise = take.height_noise(e[::coarse, ::coarse], n[::coarse, ::coarse])
-        up32 += cv2.resize(noise.astype(np.float32), shape[::-1], interpolation=cv2.INTER_LINEAR)
+        up32 += take.height_noise(*np.meshgrid(lattice.east, lattice.norths)).astype(np.float32)
     grid = Grid(left * snap, high * snap, step, shape, None)
     return grid, up32, color, kept
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -105,25 +106,54 @@ class Take:
         up: Float64 = lattice_height(height, lift, east, north, self.distortion.linear)
         return up, color
 
-    def covered(self, east: Float64, north: Float64) -> Bool:
-        """Whether centred points (any one shape) were reconstructed: inside, and in no hole."""
+    def margin(self, east: Float64, north: Float64) -> Float64:
+        """How far centred points (any one shape) are inside what was reconstructed.
+
+        Negative beyond the frayed edge and in holes; metres near the edge, a smooth measure near
+        holes.
+        """
         from data_synth.seeing_kernels import blotches
 
         west, south, right, top = self.footprint
         x, y = np.ascontiguousarray(east).ravel(), np.ascontiguousarray(north).ravel()
         inside = np.minimum(np.minimum(x - west, right - x), np.minimum(y - south, top - y))
-        bay = self.sfm.ragged * np.clip(0.5 + 0.35 * blotches(x, y, self.seed, 1.5, 4), 0.0, 1.0)
-        kept = inside > bay
+        if self.sfm.ragged > 0:
+            bay = np.clip(0.5 + 0.35 * blotches(x, y, self.seed, 1.8, 4), 0.0, 1.0)
+            inside = inside - self.sfm.ragged * bay
         if self.sfm.holes > 0:
-            kept &= blotches(x, y, self.seed + 1, 0.7, 3) < self._hole_level()
-        return kept.reshape(np.shape(east))
+            whole = self._hole_level - blotches(x, y, self.seed + 1, 1.2, 4)
+            inside = np.minimum(inside, 0.1 * whole)
+        kept: Float64 = inside.reshape(np.shape(east))
+        return kept
 
+    def covered(self, east: Float64, north: Float64) -> Bool:
+        """Whether centred points were reconstructed: inside the frayed edge, and in no hole."""
+        return self.margin(east, north) > 0
+
+    def margin_lattice(self, lattice: Lattice) -> Float32:
+        """`margin` of a lattice, linear between points about 0.04 m apart."""
+        import cv2
+
+        rows, cols = lattice.shape
+        times = max(1, round(0.04 / lattice.step))
+        if times == 1:
+            return self.margin(*np.meshgrid(lattice.east, lattice.norths)).astype(np.float32)
+        half = (times - 1) / 2.0
+        e = lattice.west + lattice.step * (half + times * np.arange(-(-cols // times)))
+        n = lattice.north - lattice.step * (half + times * np.arange(-(-rows // times)))
+        coarse = self.margin(*np.meshgrid(e, n)).astype(np.float32)
+        size = (len(e) * times, len(n) * times)
+        fine: Float32 = cv2.resize(coarse, size, interpolation=cv2.INTER_LINEAR)[:rows, :cols]
+        return fine
+
+    @cached_property
     def _hole_level(self) -> float:
         from data_synth.seeing_kernels import blotches
 
         west, south, east, north = self.footprint
-        x, y = (a.ravel() for a in np.meshgrid(*(np.linspace(*e, 80) for e in ((west, east), (south, north)))))
-        return float(np.quantile(blotches(x, y, self.seed + 1, 0.7, 3), 1.0 - self.sfm.holes))
+        x, y = np.meshgrid(np.linspace(west, east, 80), np.linspace(south, north, 80))
+        noise = blotches(x.ravel(), y.ravel(), self.seed + 1, 1.2, 4)
+        return float(np.quantile(noise, 1.0 - self.sfm.holes))
 
     def height_noise(self, east: Float64, north: Float64) -> Float64:
         """Error of the reconstructed height [m]: smooth over a few mesh spacings."""

@@ -27,25 +27,26 @@ class Site:
     roughness spectrum and slopes of a real reef flat (`docs/seafloor_vs_reef.png`).
     """
 
-    relief: float = 0.10
+    relief: float = 0.14
     relief_wavelength: float = 8.0
     hurst: float = 0.75
-    step: float = 0.25
+    step: float = 0.32
     step_wavelength: float = 4.0
     step_level: float = 0.5
-    lump: float = 0.16
-    lump_cell: float = 1.1
-    lump_gain: float = 0.60
-    grit: float = 0.008
+    lump: float = 0.32
+    lump_cell: float = 1.5
+    lump_gain: float = 0.46
+    broken_least: float = 0.15
+    grit: float = 0.0035
     sand: float = 0.0
     sand_relief: float = 0.02
     ripple: float = 0.012
     ripple_wavelength: float = 0.14
-    ripple_wander: float = 0.9
+    ripple_wander: float = 0.5
     rubble: float = 0.3
     turf: float = 0.8
     coralline: float = 0.5
-    tone: tuple[float, float, float] = (1.0, 0.93, 0.80)
+    tone: tuple[float, float, float] = (1.0, 0.88, 0.68)
     sand_tone: tuple[float, float, float] = (0.46, 0.41, 0.31)
     boulder: float = 0.0
     boulder_size: float = 1.0
@@ -89,6 +90,7 @@ def bare_ground(site: Site, seed: int) -> t.Ground:
         lump=site.lump,
         lump_cell=site.lump_cell,
         lump_gain=site.lump_gain,
+        broken_least=site.broken_least,
         grit=site.grit,
         sand_level=-1e9,
         sand_relief=site.sand_relief,
@@ -243,7 +245,7 @@ def make_seafloor(site: Site, seed: int, bounds: Bounds) -> Seafloor:
 SITES: dict[str, Site] = {
     "reef": Site(),
     "low_reef": replace(
-        Site(), relief=0.07, step=0.10, lump=0.08, boulder=0.0, massive=1.6, branching=1.4, plate=0.4,
+        Site(), relief=0.07, step=0.0, lump=0.13, boulder=0.0, massive=1.6, branching=1.4, plate=0.4,
         coral_size=0.7, sand=0.18,
     ),
     "boulders": replace(

@@ -140,10 +140,10 @@ def see(
 
     from data_synth.seeing_kernels import encode, radiance
 
-    soft = local_mean(height, 0.06 / lattice.step)
-    linear = radiance(
-        height, soft, albedo, lattice.step, lattice.west, lattice.north, -1.0 if mirror else 1.0, plan
-    )
+    soft = local_mean(height, 0.04 / lattice.step)
+    wide = local_mean(height, 0.25 / lattice.step)
+    place = (lattice.step, lattice.west, lattice.north, -1.0 if mirror else 1.0)
+    linear = radiance(height, soft, wide, albedo, *place, plan)
     if seeing.particles > 0:
         _strew_particles(linear, lattice, seeing, plan)
     if seeing.blur > 0.3 * lattice.step:

@@ -37,14 +37,36 @@ def nearest_camera(x, y, plan):
     return dx, dy, na, nc, high
 
 
+@jit(nogil=True)
+def shadow(z, i, j, step, east, north, rise):
+    """Share of a lamp's light that reaches sample (i, j): 0 in shadow, 1 in the open.
+
+    The lamp stands towards (`east`, `north`), a unit vector, at slope `rise`; the way is tried at
+    growing distances, which is enough for soft shadows up to half a metre long.
+    """
+    rows, cols = z.shape
+    here, light, far = z[i, j], 1.0, 1.5
+    while far * step < 0.6:
+        a, b = int(i - north * far + 0.5), int(j + east * far + 0.5)
+        if a < 0 or b < 0 or a >= rows or b >= cols:
+            break
+        length = far * step
+        over = (z[a, b] - here - length * rise) / (0.15 * length + 0.004)
+        light = min(light, 1.0 - over)
+        if light <= 0.0:
+            return 0.0
+        far *= 1.55
+    return light
+
+
 @jit(parallel=True, nogil=True)
-def radiance(z, soft, albedo, step, west, north, mirror, plan):
+def radiance(z, soft, wide, albedo, step, west, north, mirror, plan):
     """Linear colour (H, W, 3) f32 that the cameras saw of a lattice of the seafloor.
 
     Parameters
     ----------
-    z, soft : (H, W) f32
-        Height [m] and its local mean, for the dimness of crevices.
+    z, soft, wide : (H, W) f32
+        Height [m] and its means nearby and further around, for the dimness of crevices and hollows.
     albedo : (H, W, 3) f32
     step, west, north : float
         Spacing and first sample's centre in the survey's centred frame [m].
@@ -70,10 +92,15 @@ def radiance(z, soft, albedo, step, west, north, mirror, plan):
             x = west + j * step
             da, dc, na, nc, high = nearest_camera(x, y, plan)
             # crevices see less of the sky
-            open_sky = 1.0 + plan.crevice * (z[i, j] - soft[i, j])
-            open_sky = min(1.15, max(0.30, open_sky)) * (0.55 + 0.45 * norm)
-            sun = max(0.0, (rise - lie * (gx * sun_x * mirror + gy * sun_y)) * norm)
-            light = plan.ambient * open_sky + plan.sun * sun * min(1.0, open_sky + 0.1)
+            near = min(1.2, max(0.25, 1.0 + plan.crevice * (z[i, j] - soft[i, j])))
+            around = min(1.15, max(0.4, 1.0 + 0.2 * plan.crevice * (z[i, j] - wide[i, j])))
+            open_sky = near * around * (0.5 + 0.5 * norm)
+            light = plan.ambient * open_sky
+            if plan.sun > 0.0:
+                sun = max(0.0, (rise - lie * (gx * sun_x * mirror + gy * sun_y)) * norm)
+                if sun > 0.0:
+                    sun *= shadow(z, i, j, step, sun_x * mirror, sun_y, rise / lie)
+                light += plan.sun * sun * min(1.0, near + 0.2)
             if plan.caustics > 0.0:
                 salt = plan.seed + 31 * na + 17 * nc
                 a = abs(gradient_noise(x * 5.0, y * 5.0, salt))
@@ -89,9 +116,12 @@ def radiance(z, soft, albedo, step, west, north, mirror, plan):
                     far = math.sqrt(la * la + lc * lc + lz * lz)
                     face = (lz - gx * ex - gy * ey) * norm / far
                     beam = (lz / far) ** 4
-                    power = 1.0 if k == 0 else plan.strobe_balance
-                    flash += power * max(0.0, face) * beam * (high / far) ** 2
-                light += plan.strobe * flash * min(1.0, open_sky + 0.15)
+                    power = (1.0 if k == 0 else plan.strobe_balance) * max(0.0, face)
+                    flat = math.sqrt(ex * ex + ey * ey)
+                    if power > 0.0 and flat > 0.05:
+                        power *= shadow(z, i, j, step, ex / flat, ey / flat, lz / flat)
+                    flash += power * beam * (high / far) ** 2
+                light += plan.strobe * flash * min(1.0, near + 0.2)
             view = math.sqrt(da * da + dc * dc + high * high)
             edge = (high / view) ** (4.0 * plan.vignette)
             gain = 1.0 + plan.seams * (2.0 * hash01(na, nc, plan.seed + 7) - 1.0)

@@ -60,6 +60,7 @@ class Ground(NamedTuple):
     lump: float  # height of the largest rock lumps
     lump_cell: float
     lump_gain: float  # height ratio of each halving of the lumps' size
+    broken_least: float  # roughness of the smoothest ground against the most broken
     grit: float  # standard deviation of the finest relief at 0.10 m
     sand_level: float  # height of the sand; -1e9 is none
     sand_relief: float

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -22,6 +22,7 @@ from meshreg.settings import JudgeSettings, Settings
 from meshreg.types import Float64, OffsetEstimate, SurveyRaster, Verdict
 
 TURNS = tuple((turn, flip) for turn in range(4) for flip in (False, True))[1:]
+SCORED_OVERLAP = 0.10  # of the largest: the neutral measure is fair to small overlaps
 TURN_NAMES = {
     (0, True): "mirrored east-west",
     (2, True): "mirrored north-south",
@@ -45,6 +46,8 @@ class ChannelMap:
         Evidence in deviations of chance (`neutral.surface`).
     counts : (K, L) float64
         Cells in the overlap.
+    cells : int
+        Cells of the smaller survey.
     peak : Peak or None
     null_gap : float
         Mean gap of the mirrored and turned maps; the scale on which gaps are exponential.
@@ -56,6 +59,7 @@ class ChannelMap:
     window: Window
     surface: Float64
     counts: Float64
+    cells: int
     peak: Peak | None
     null_gap: float
     turned: Mapping[str, float]
@@ -98,6 +102,13 @@ class Judgement:
     false_alarm: float = 1.0
     maps: Mapping[str, ChannelMap] = field(default_factory=dict)
 
+    def doubted(self, reason: str) -> Judgement:
+        """Return the same judgement, no better than "review" where there is a reason to doubt."""
+        if not reason:
+            return self
+        verdict: Verdict = "review" if self.verdict == "accepted" else self.verdict
+        return replace(self, verdict=verdict, reason=f"{reason} ({self.reason})")
+
 
 def judge(
     estimates: Sequence[OffsetEstimate],
@@ -118,7 +129,7 @@ def judge(
     """
     maps: dict[str, ChannelMap] = {}
     for channel, raster in (("terrain", "dem"), ("image", "ortho")):
-        found = channel_map(*rasters[raster], channel, radius, settings.search.min_overlap)  # type: ignore[arg-type]
+        found = channel_map(*rasters[raster], channel, radius, SCORED_OVERLAP)  # type: ignore[arg-type]
         if found is not None:
             maps[channel] = found
     if not maps:
@@ -172,7 +183,8 @@ def channel_map(
     # scale for the rest, hence the median; ln 2 turns an exponential's median into its mean.
     gaps = list(turned.values())
     null_gap = max(float(np.median(gaps)) / math.log(2) if gaps else 0.0, 0.3)
-    return ChannelMap(channel, window, surface, counts, peak, null_gap, turned)
+    smaller = min(int(mask.sum()) for mask in valid)
+    return ChannelMap(channel, window, surface, counts, smaller, peak, null_gap, turned)
 
 
 def _candidates(
@@ -258,10 +270,10 @@ def _fused(
 
 
 def _overlap_at(channel: ChannelMap, at: tuple[float, float]) -> float:
-    """Overlap at an offset as a share of the largest in the window."""
+    """Overlap at an offset as a share of the smaller survey's cells."""
     col = int(np.argmin(np.abs(channel.window.east - at[0])))
     row = int(np.argmin(np.abs(channel.window.north - at[1])))
-    return float(channel.counts[row, col] / max(float(channel.counts.max()), 1.0))
+    return float(channel.counts[row, col] / channel.cells)
 
 
 def _verdict(
@@ -302,7 +314,7 @@ def _verdict(
             "another place, too much change, or beyond the search radius",
         )
     if best.overlap < settings.min_overlap:
-        return say("review", f"the surveys overlap by only {best.overlap:.0%} of what they could")
+        return say("review", f"the surveys overlap by only {best.overlap:.0%}")
     edge = radius - max(abs(best.east), abs(best.north))
     if edge < 2 * max(channel.window.cell for channel in maps.values()):
         return say(

@@ -103,8 +103,8 @@ def register_pair(
     if judgement.best is not None and judgement.verdict != "rejected":
         with clock.stage("refine"):
             refined = _refine(judgement, pairs, settings)
-            if refined.note:
-                notes.append(refined.note)
+            notes += [refined.note] if refined.note else []
+            judgement = judgement.doubted(refined.doubt)
     with clock.stage("apply"):
         transform, up_sigma, rasters = _lay_down(reference, moving, refined, settings, masks, pairs)
     return Registration(
@@ -327,7 +327,8 @@ def _too_far(
 ) -> Registration:
     reason = (
         f"the surveys lie {away:.4g} m apart, beyond the search radius of "
-        f"{settings.search.radius:g} m; check their shifts (--reference-shift, --moving-shift) and CRS"
+        f"{settings.search.radius:g} m; check their shifts "
+        "(--reference-shift, --moving-shift) and CRS"
     )
     estimates = tuple(
         OffsetEstimate(m, "failed", "the surveys do not overlap") for m in settings.methods

@@ -62,6 +62,9 @@ class Refined:
         Tile offset less the rigid answer's [m].
     weights : (M,) float64
     note : str
+        What the user should know.
+    doubt : str
+        Why the answer cannot be accepted, if so.
     """
 
     pivot: Float64
@@ -72,6 +75,7 @@ class Refined:
     residuals: Float64 | None = None
     weights: Float64 | None = None
     note: str = ""
+    doubt: str = ""
 
 
 def refine(
@@ -102,14 +106,17 @@ def refine(
         return replace(coarse, note="too few tiles match on their own to measure yaw")
     turning = fit(tiles, centre, yaw_free=True)
     yaw_sigma = float(np.sqrt(turning.covariance[2, 2]))
-    significant = abs(turning.yaw) > 3 * yaw_sigma
+    significant = abs(turning.yaw) > 2 * yaw_sigma
     if significant and abs(turning.yaw) > MAX_YAW:
-        note = f"tiles turn by {np.rad2deg(turning.yaw):.2f}°, more than is searched (±1°)"
-        return replace(coarse, tiles=tiles, note=note)
+        turn = np.rad2deg(turning.yaw)
+        doubt = f"the surveys are turned by about {turn:.1f}°, beyond the ±1° searched"
+        return replace(coarse, doubt=doubt)
     best = turning if significant else fit(tiles, centre, yaw_free=False)
     if float(np.hypot(*(best.offset - offset))) > agree:
         moved = float(np.hypot(*(best.offset - offset)))
-        return replace(coarse, note=f"the tiles' mean is {moved:.2f} m from the judged offset")
+        return replace(
+            coarse, doubt=f"tiles matched alone lie {moved:.2f} m from the whole's offset"
+        )
     return best
 
 

@@ -42,7 +42,7 @@ class SearchSettings:
     radius: float | None = (
         None  # per axis [m]; None: 10 m, more where the DEM is coarser than 0.10 m
     )
-    min_overlap: float = 0.30  # of the largest possible overlap; smaller ones are not scored
+    min_overlap: float = 0.10  # of the largest in the window (paper: 0.30); less is not scored
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ class JudgeSettings:
     """Accept, review or reject (`meshreg.judge`)."""
 
     agree_distance: float = 0.25  # [m], or 2.5 DEM cells where that is more
-    min_overlap: float = 0.25
+    min_overlap: float = 0.25  # of the smaller survey's cells; less goes to review
     support_gap: float = 1.5  # a channel that puts a place first by this much supports it
     accept_gap: float = 4.0
     overwhelming_gap: float = 8.0
@@ -110,6 +110,7 @@ class Settings:
         if preset == "paper":
             return cls(
                 preset="paper",
+                search=SearchSettings(min_overlap=0.30),
                 sift=SiftSettings(exhaustive_vote=False, ratio=1.0),
                 terrain=TerrainSettings(high_pass=()),
                 mutual_information=MutualInformationSettings(bins=256, high_pass=0.0, direct=True),

@@ -38,7 +38,7 @@ class Voice:
 
     def document(self, document: Any) -> None:
         """Print a JSON document on stdout; nothing else may be there."""
-        from meshreg.io.record import to_json
+        from meshreg.io.document import to_json
 
         sys.stdout.write(to_json(document))
         sys.stdout.flush()

@@ -20,6 +20,7 @@ from meshreg.types import Bool, Int32, Mesh, PointCloud, SourceFile, Survey, Tex
 
 _LOG = logging.getLogger("meshreg")
 _MOST_LOST = 0.01  # share of points that may be NaN or infinite
+_LARGEST = 1e12  # coordinates beyond are damage: no unit makes the Earth that large
 _MOST_WRAPPED = 0.01  # share of texture coordinates that may lie outside the page unsaid
 _AXES = np.eye(3)
 
@@ -150,20 +151,20 @@ def _keep_faces(raw: RawGeometry, keep: Bool) -> RawGeometry:
 
 def _without_lost_points(raw: RawGeometry, path: Path) -> tuple[RawGeometry, tuple[str, ...]]:
     """Leave out points that are not finite, and the faces that touch them."""
-    finite = _rows(np.isfinite(raw.points))
+    finite = _rows(np.abs(raw.points) < _LARGEST)
     lost = len(finite) - int(np.count_nonzero(finite))
     if not lost:
         return raw, ()
     if lost > _MOST_LOST * len(finite):
         first = int(np.flatnonzero(~finite)[0])
         raise InputError(
-            f"has {lost} points of {len(finite)} that are NaN or infinite "
-            f"(more than {_MOST_LOST:.0%}).",
+            f"has {lost} points of {len(finite)} that are not finite numbers below "
+            f"{_LARGEST:g} (more than {_MOST_LOST:.0%}).",
             file=path,
             place=f"vertex {first + 1}",
             remedy="Remove them in the program that made the file, or export it again.",
         )
-    text = f"{lost} points that are NaN or infinite were dropped"
+    text = f"{lost} points that are not finite numbers were dropped"
     if raw.faces is not None:
         whole = _rows(finite[raw.faces])
         text += f", with {len(whole) - int(np.count_nonzero(whole))} faces that touch them"

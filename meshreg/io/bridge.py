@@ -62,7 +62,7 @@ class Bridge:
             10 m.
         """
         points = np.asarray(points, float)
-        moved = np.empty_like(points)
+        moved: Float64 = np.empty_like(points)
         for start in range(0, len(points), _CHUNK):
             part = points[start : start + _CHUNK]
             moved[start : start + _CHUNK] = self._run(part, back)
@@ -81,8 +81,15 @@ class Bridge:
             x, y = part.mean(axis=0)[:2]
             start = self.target if back else self.source
             raise outside_error(start, x, y, short(error)) from error
+        # Far outside a projection PROJ may answer with infinity and no error.
+        bad = ~np.isfinite(result).all(axis=0)
+        if bad.any():
+            x, y = part[bad][0, :2]
+            start = self.target if back else self.source
+            raise outside_error(start, x, y, f"{np.count_nonzero(bad)} points cannot be moved")
         moved: Float64 = np.empty_like(part)
-        moved[:, : len(columns)] = np.stack(result, axis=1)
+        for axis, column in enumerate(result):
+            moved[:, axis] = column
         if not self.spatial:
             moved[:, 2] = part[:, 2] / self.factor if back else part[:, 2] * self.factor
         return moved
@@ -91,15 +98,17 @@ class Bridge:
         """Say by which operation the datum changes at a place; empty where it does not."""
         self._run(np.asarray(point, float).reshape(1, 3))
         name, accuracy = self._accuracy()
-        if not self.changes_datum or accuracy == 0:
+        if accuracy == 0:
             return ""
         return f"{short(name, 200)}, accuracy {accuracy:g} m{self.lacking}"
 
     def _accuracy(self) -> tuple[str, float]:
         """Return name and accuracy [m] of the operation last used; refuse one known too badly."""
+        if not self.changes_datum:
+            return "", 0.0
         operation = self.transformer.get_last_used_operation()
         name, accuracy = str(operation.description), float(operation.accuracy)
-        if self.changes_datum and not 0 <= accuracy <= _WORST_ACCURACY:
+        if not 0 <= accuracy <= _WORST_ACCURACY:
             known = "unknown" if accuracy < 0 else f"{accuracy:g} m"
             raise InputError(
                 f"the change from {crs_name(self.source)} to {crs_name(self.target)} is not known "

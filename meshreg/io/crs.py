@@ -107,8 +107,9 @@ def text_of(crs: Any) -> str | None:
 
     if crs.is_engineering:
         return None
-    authority = crs.to_authority(min_confidence=70)
-    if authority is not None:
+    for authority in (crs.to_authority("EPSG", 70), crs.to_authority(None, 70)):
+        if authority is None:
+            continue
         code = f"{authority[0]}:{authority[1]}"
         if pyproj.CRS(code).equals(crs, ignore_axis_order=True):
             return code

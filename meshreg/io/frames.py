@@ -170,7 +170,6 @@ def place(
     default_axes: Any = None,
     *,
     georeferenced: bool = False,
-    bounds: Any = None,
 ) -> Placed:
     """Do what every reader does with its points: find the sidecar, the frame and a local origin.
 
@@ -185,8 +184,6 @@ def place(
     georeferenced : bool
         The format states absolute coordinates itself (LAS, GeoTIFF): a shift file that speaks for
         a whole folder (offset.xyz, coords.txt, SHIFT.txt) is not meant for it.
-    bounds : (2, 3) array, optional
-        Lowest and highest of the coordinates that are in use, where not of all `xyz`.
 
     Raises
     ------
@@ -196,16 +193,16 @@ def place(
     xyz = np.asarray(xyz)
     if not len(xyz):
         raise InputError("holds no points.", file=path, remedy="Export it again.")
-    ends = np.asarray(bounds if bounds is not None else [xyz.min(axis=0), xyz.max(axis=0)], float)
+    ends = np.asarray([xyz.min(axis=0), xyz.max(axis=0)], float)
     if not np.isfinite(ends).all():
         raise InputError(f"has coordinates {ends.tolist()} that are not finite.", file=path)
     notes = _single_precision_note(path, xyz, ends)
     sidecar = find_sidecar(path, shared=not georeferenced)
-    centre = ends[0] / 2 + ends[1] / 2
+    # The median, because a single stray point must not decide where the survey is.
+    centre = np.median(xyz[:: max(1, len(xyz) // 10_000)].astype(np.float64), axis=0)
     try:
         frame = frame_from(options, sidecar, file_crs, default_axes, centre=centre)
-        corners = np.stack(np.meshgrid(*ends.T, indexing="ij"), axis=-1).reshape(-1, 3)
-        origin = np.round(to_absolute(frame, corners).mean(axis=0))
+        origin = np.round(to_absolute(frame, centre[None])[0])
         points = _from_origin(frame, xyz, origin)
         notes += _frame_notes(options, sidecar, frame, centre)
     except MeshregError as error:

@@ -146,8 +146,11 @@ def las_errors(path: Path, error_type: type[MeshregError] = InputError) -> Itera
         raise
     except BaseException as error:  # a Rust panic is no Exception
         kind, text = type(error).__name__, " ".join(str(error).split())
+        reading = issubclass(error_type, InputError)
         raise error_type(
-            f"cannot be read: {kind}: {text[:200]}.", file=path, remedy=_DAMAGED
+            f"cannot be {'read' if reading else 'written'}: {kind}: {text[:200]}.",
+            file=path,
+            remedy=_DAMAGED if reading else "Free space, or choose another folder.",
         ) from error
 
 

@@ -41,9 +41,11 @@ from meshreg.io.obj_text_kernels import (
 )
 from meshreg.jit import jit
 
-MAX_LINE = 1 << 20
 # Kinds of events: the first two name something, the others are words that only Python can read.
 USEMTL, MTLLIB, POINT_WORD, COLOR_WORD, UV_WORD, IDLE_WORD = 1, 2, 3, 4, 5, 6
+
+MAX_LINE = 1 << 20
+MANY = 1000  # lines read before the fast kernel gets its turn again
 
 _SLASH, _HASH, _BACKSLASH = 47, 35, 92
 _USEMTL = np.frombuffer(b"usemtl", np.uint8).copy()
@@ -235,31 +237,35 @@ def _statement(
 
 @jit(nogil=True)
 def parse(
-    data: Any, end: int, state: Any, points: Any, colors: Any, uvs: Any, faces: Any, events: Any
-) -> None:
-    """Read whole lines of an OBJ file.
+    data: Any, here: int, end: int, stop: int, state: Any, floats: Any, faces: Any, events: Any
+) -> int:
+    """Read up to `MANY` whole lines of any kind; return the place behind them.
 
     Parameters
     ----------
     data : (end + 4 or more,) uint8
         The lines, followed by four line ends.
-    end : int
+    here, end : int
+        Where to start (a line's first byte), and the place behind the last line.
+    stop : int
+        Number of faces at which to stop, or -1.
     state : (N_STATE,) int64
-        In: zeros, with the number of faces at which to stop, or -1, in ``state[ERROR_AT]``. Out:
-        the counts; on an error its code and its byte, ``state[LINES]`` being the lines before it.
-    points : (end // 6 + 2, 3) float64
-    colors : (end // 6 + 2, 3) float32
-    uvs : (end // 4 + 2, 2) float32
-    faces : tuple of (end // 2 + 2,) int32 vertex, the same uv, (end // 6 + 2,) int32 sizes
-        Corners from 0, -1 where there is no uv, NEGATIVE plus an index from the first of these
-        lines for a negative one.
+        Counts, added to. On an error also its code and its byte; ``state[LINES]`` are then the
+        lines before it.
+    floats : tuple
+        points (end // 6 + 2, 3) float64, colors (end // 6 + 2, 3) float32, uvs (end // 4 + 2, 2)
+        float32.
+    faces : tuple
+        vertex (end // 2 + 2,) int32, uv the same, sizes (end // 6 + 2,) int32. Corners from 0; -1
+        where there is no uv; NEGATIVE plus an index from the first of these lines for a negative
+        one.
     events : (end // 2 + 2, 5) int64
         Kind, faces before (of a name) or place in the flat array (of a word), first byte, byte
         behind it, lines before.
     """
-    stop = state[ERROR_AT]
-    here = 0
-    while here < end:
+    points, colors, uvs = floats
+    last = state[LINES] + MANY
+    while here < end and state[LINES] < last:
         start, lines = here, state[LINES]
         here = skip_blanks(data, here, state)
         if state[FACES] == stop and data[here] == 102:
@@ -274,4 +280,5 @@ def parse(
                 place, error = start, LONG_LINE
         if error != OK:
             state[ERROR], state[ERROR_AT], state[LINES] = error, place, lines
-            return
+            return end
+    return here

@@ -23,6 +23,10 @@ from meshreg.types import Float32, Float64, Int32
 
 _NUMBER = re.compile(rb"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 _NONFINITE = re.compile(rb"[+-]?(nan|inf|1\.#)", re.IGNORECASE)  # as C libraries print them
+_COUNTED = (
+    *("VERTICES", "UVS", "NORMALS", "FACES", "OBJECTS", "GROUPS"),
+    *("ELEMENTS", "OTHERS", "WEIGHTED", "COLORED"),
+)
 _REPAIR = "Export the file again, or repair the line."
 
 
@@ -133,16 +137,21 @@ class _Worker:
 
     def __call__(self, block: Block, stop: int = -1) -> _Lines:
         from meshreg.io import obj_text_kernels as text
+        from meshreg.io.obj_fast_kernels import parse_plain
         from meshreg.io.obj_kernels import parse
 
         try:
             scratch = self._scratch.pop()
         except IndexError:
             scratch = _new_scratch(2 * BLOCK)
-        points, colors, uvs, (vertex, uv, sizes), events = scratch
+        floats, faces, events = scratch
         state = np.zeros(text.N_STATE, np.int64)
-        state[text.ERROR_AT] = stop
-        parse(block.data, block.end, state, points, colors, uvs, (vertex, uv, sizes), events)
+        here = 0
+        while here < block.end:
+            here = parse_plain(block.data, here, block.end, stop, state, floats, faces)
+            if here < block.end:
+                here = parse(block.data, here, block.end, stop, state, floats, faces, events)
+        (points, colors, uvs), (vertex, uv, sizes) = floats, faces
         n_points, n_uvs, n_corners = state[[text.VERTICES, text.UVS, text.CORNERS]]
         lines = _Lines(
             state,
@@ -164,9 +173,11 @@ class _Worker:
 def _new_scratch(size: int) -> Any:
     """Return arrays that what is in a block of `size` bytes fits; untouched pages cost nothing."""
     return (
-        np.empty((size // 6 + 2, 3)),
-        np.empty((size // 6 + 2, 3), np.float32),
-        np.empty((size // 4 + 2, 2), np.float32),
+        (
+            np.empty((size // 6 + 2, 3)),
+            np.empty((size // 6 + 2, 3), np.float32),
+            np.empty((size // 4 + 2, 2), np.float32),
+        ),
         (
             np.empty(size // 2 + 2, np.int32),
             np.empty(size // 2 + 2, np.int32),
@@ -279,11 +290,7 @@ class _Joiner:
 
         totals, parts = self._totals, self._parts
         self._parts = []
-        counts = {
-            name.lower(): int(totals[getattr(text, name)])
-            for name in ("VERTICES", "UVS", "NORMALS", "FACES", "OBJECTS", "GROUPS")
-            + ("ELEMENTS", "OTHERS", "WEIGHTED", "COLORED")
-        }
+        counts = {name.lower(): int(totals[getattr(text, name)]) for name in _COUNTED}
         sizes = uv = colors = None
         if totals[text.POLYGONS]:
             sizes = [_filled(part.sizes, int(part.state[text.FACES]), 3) for part in parts]

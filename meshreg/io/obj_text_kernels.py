@@ -34,13 +34,13 @@ _HASH, _BACKSLASH = 35, 92
 @jit(nogil=True)
 def is_blank(byte: Any) -> bool:
     """Whether a byte separates words."""
-    return byte == 32 or byte == 9  # noqa: PLR1714  (compiles to two comparisons)
+    return bool(byte == 32 or byte == 9)  # noqa: PLR1714  (compiles to two comparisons)
 
 
 @jit(nogil=True)
 def is_end(byte: Any) -> bool:
     """Whether the statement is over: a line end or a comment."""
-    return byte == 10 or byte == 13 or byte == _HASH  # noqa: PLR1714
+    return bool(byte == 10 or byte == 13 or byte == _HASH)  # noqa: PLR1714
 
 
 @jit(nogil=True)

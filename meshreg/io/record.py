@@ -1,289 +1,176 @@
-"""`registration.json`: the result as a document, and the folder that holds it.
-
-The document's schema is `registration.schema.json` beside this module. Numbers carry 17 digits,
-so that reading gives back the same float64; what is not a number is null.
-"""
+"""The folder of a result: `registration.json`, transforms, maps, the registered survey."""
 
 from __future__ import annotations
 
-import json
-import math
-import re
-from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from meshreg.errors import InputError, UsageError
-from meshreg.types import OffsetEstimate, Registration, Transform
+from meshreg.io.document import read_registration, registration_document, to_json
+from meshreg.types import Frame, PointCloud, Registration, SourceFile, Survey, Transform
 
-SCHEMA = "meshreg.registration/1"
-MAX_BYTES = 64_000_000  # a real record has some 20 kB
-_VERDICTS = ("accepted", "review", "rejected")
-_STATUSES = ("ok", "weak", "failed")
-_NUMBERS = ("overlap", "height_median", "height_nmad", "height_rmse", "image_similarity")
-
-
-def registration_document(registration: Registration) -> dict[str, Any]:
-    """Return the registration as plain dictionaries, lists, strings, numbers and None.
-
-    Its `transform.reference_from_moving` are the rows of the 4×4 matrix on absolute coordinates;
-    `offset` is what that matrix does to the pivot, the centre of the moving survey's bounding
-    box. Both are None when the registration is rejected.
-    """
-    transform = registration.transform
-    matrix = pivot = offset = scale = yaw = None
-    if transform is not None:
-        matrix, pivot = transform.matrix.tolist(), transform.pivot.tolist()
-        offset = dict(zip(("east", "north", "up"), transform.offset.tolist(), strict=True))
-        scale = transform.scale
-        yaw = math.degrees(math.atan2(transform.rotation[1, 0], transform.rotation[0, 0]))
-    covariance = registration.covariance
-    document = {
-        "schema": registration.schema,
-        "verdict": registration.verdict,
-        "reason": registration.reason,
-        "transform": {
-            "reference_from_moving": matrix,
-            "pivot": pivot,
-            "scale": scale,
-            "yaw_degrees": yaw,
-        },
-        "offset": offset,
-        "covariance": None if covariance is None else covariance.tolist(),
-        "methods": {e.method: _estimate_document(e) for e in registration.estimates},
-        "hypotheses": [dict(hypothesis) for hypothesis in registration.hypotheses],
-        "before": dict(registration.before),
-        "after": dict(registration.after),
-        "reference": dict(registration.reference),
-        "moving": dict(registration.moving),
-        "settings": dict(registration.settings),
-        "versions": dict(registration.versions),
-        "seconds": dict(registration.seconds),
-        "notes": list(registration.notes),
-    }
-    plain: dict[str, Any] = _plain(document, "registration")
-    return plain
+__all__ = [
+    "matrix_text",
+    "read_registration",
+    "reference_stand_in",
+    "registration_document",
+    "to_json",
+    "write_record_files",
+    "write_registration",
+]
 
 
-def _estimate_document(estimate: OffsetEstimate) -> dict[str, Any]:
-    found = math.isfinite(estimate.east) and math.isfinite(estimate.north)
-    sigma = None if estimate.sigma is None else np.sqrt(np.diag(estimate.sigma)).tolist()
-    return {
-        "status": estimate.status,
-        "offset": [estimate.east, estimate.north] if found else None,
-        "sigma": sigma,
-        "covariance": None if estimate.sigma is None else estimate.sigma.tolist(),
-        "score": estimate.score,
-        "gap": estimate.gap,
-        "overlap": estimate.overlap,
-        "reason": estimate.reason,
-        "seconds": estimate.seconds,
-    }
+def write_registration(
+    registration: Registration,
+    folder: str | Path,
+    *,
+    reference: Survey | None = None,
+    moving: Survey | None = None,
+    overwrite: bool = False,
+) -> tuple[Path, ...]:
+    """Write a result's folder, whole or not at all: record, transforms, maps, registered survey.
 
+    Parameters
+    ----------
+    registration : Registration
+    folder : path
+        Must not exist, unless `overwrite` and it holds a former result.
+    reference, moving : Survey, optional
+        As read from their files. Without them there are no transforms between file coordinates,
+        and no registered survey.
+    overwrite : bool
 
-def _plain(value: Any, place: str) -> Any:
-    """Reduce NumPy values, mappings and tuples to what JSON has; NaN and infinity to None."""
-    if value is None or isinstance(value, str | bool):
-        return value
-    if isinstance(value, Mapping):
-        return {str(key): _plain(item, f"{place}.{key}") for key, item in value.items()}
-    if isinstance(value, np.ndarray | np.generic):
-        return _plain(value.tolist(), place)
-    if isinstance(value, int):
-        return value
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, Path):
-        return str(value)
-    if isinstance(value, Sequence):
-        return [_plain(item, place) for item in value]
-    raise UsageError(f"{place} holds a {type(value).__name__}, which JSON cannot say.")
-
-
-def to_json(value: Any) -> str:
-    """Return plain values as strict JSON text: floats with 17 digits, short lists on one line.
+    Returns
+    -------
+    tuple of Path
+        The files written.
 
     Raises
     ------
     UsageError
-        For NaN, infinity or anything else that JSON cannot say.
+        If the folder exists and may not be replaced.
+    OutputError
+        If a file could not be written or did not read back as it should.
     """
-    return _encode(value, "") + "\n"
+    from meshreg.io.atomic import atomic_folder
+
+    folder = Path(folder)
+    with atomic_folder(folder, overwrite) as partial:
+        files = write_record_files(registration, partial, reference=reference, moving=moving)
+        names = [path.relative_to(partial) for path in files]
+    return tuple(folder / name for name in names)
 
 
-def _encode(value: Any, indent: str) -> str:
-    if isinstance(value, float):
-        if not math.isfinite(value):
-            raise UsageError(f"{value} cannot be said in JSON.")
-        text = format(value, ".17g")
-        return text if re.search(r"[.e]", text) else text + ".0"  # a float stays a float
-    if isinstance(value, str):
-        return _quoted(value)
-    if value is None or isinstance(value, bool | int):
-        return json.dumps(value)
-    inner = indent + "  "
-    if isinstance(value, dict):
-        items = [f"{_quoted(str(key))}: {_encode(item, inner)}" for key, item in value.items()]
-        brackets = "{}"
-    elif isinstance(value, list | tuple):
-        items = [_encode(item, inner) for item in value]
-        brackets = "[]"
-        if not any(isinstance(item, dict | list | tuple | str) for item in value):
-            return f"[{', '.join(items)}]"
-    else:
-        raise UsageError(f"A {type(value).__name__} cannot be said in JSON.")
-    if not items:
-        return brackets
-    body = f",\n{inner}".join(items)
-    return f"{brackets[0]}\n{inner}{body}\n{indent}{brackets[1]}"
+def write_record_files(
+    registration: Registration,
+    folder: Path,
+    *,
+    reference: Survey | None = None,
+    moving: Survey | None = None,
+) -> tuple[Path, ...]:
+    """Write what `write_registration` does into a folder that is there (and not yet final)."""
+    import tomli_w
+
+    written = [_write_text(folder / "settings.toml", tomli_w.dumps(dict(registration.settings)))]
+    written += _write_maps(registration, folder)
+    transform = registration.transform
+    if transform is not None:
+        text = matrix_text(transform.matrix)
+        written.append(_write_text(folder / "transform_global.txt", text))
+        if reference is not None and moving is not None:
+            written += _write_file_transforms(transform, folder, reference, moving)
+        if moving is not None and moving.source:
+            from meshreg.io import rewrite_survey
+
+            written += rewrite_survey(moving, transform, folder, reference)
+    text = to_json(registration_document(registration))
+    written.append(_write_text(folder / "registration.json", text))
+    return tuple(written)
 
 
-def _quoted(text: str) -> str:
-    try:
-        text.encode("utf-8")
-    except UnicodeEncodeError:  # a file name that is no UTF-8
-        return json.dumps(text)
-    return json.dumps(text, ensure_ascii=False)
+def _write_text(path: Path, text: str) -> Path:
+    from meshreg.io.atomic import as_output_error
+
+    with as_output_error(path):
+        path.write_text(text, encoding="utf-8")
+    return path
 
 
-def read_registration(path: str | Path) -> Registration:
-    """Read `registration.json`, or the one in a folder that `meshreg register` wrote.
+def _write_maps(registration: Registration, folder: Path) -> list[Path]:
+    """Write both surveys after registration, on one grid; a rejected pair has none to show."""
+    from meshreg.io.maps import write_raster
 
-    Parameters
-    ----------
-    path : path
-        The file, or the folder that holds it.
+    written: list[Path] = []
+    if registration.transform is None:
+        return written
+    for name in ("reference_dem", "moving_dem", "reference_ortho", "moving_ortho"):
+        raster = registration.evidence.get(name)
+        is_height = name.endswith("dem")
+        if raster is None or not (is_height or raster.color_valid.any()):
+            continue
+        path = folder / f"{name}.tif"
+        write_raster(raster, path, "height" if is_height else "color")
+        written.append(path)
+    return written
 
-    Returns
-    -------
-    Registration
-        Without evidence (the rasters and score surfaces live in memory only).
 
-    Raises
-    ------
-    InputError
-        If it is no registration, contradicts itself, or was written by a newer meshreg.
+def _write_file_transforms(
+    transform: Transform, folder: Path, reference: Survey, moving: Survey
+) -> list[Path]:
+    """Write `transform.txt` and its inverse: the moving FILE's coordinates to the reference's.
+
+    Blocks of one survey share their frame; where they do not, each other frame gets a pair of
+    files of its own, named after its first block.
     """
-    from meshreg.io.safe import open_regular
+    from meshreg.io.frames import make_mover, to_file
 
-    path = Path(path)
-    if path.is_dir():
-        path = path / "registration.json"
-    with open_regular(path) as file:
-        text = file.read(MAX_BYTES + 1)
-    if len(text) > MAX_BYTES:
-        raise InputError(f"is larger than {MAX_BYTES} bytes; that is no registration.", file=path)
-    document = _parse(text, path)
-    try:
-        return _registration(document, path)
-    except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
-        raise InputError(
-            f"is no complete registration ({type(error).__name__}: {error}).",
-            file=path,
-            remedy="Run `meshreg register` again.",
-        ) from error
-
-
-def _parse(text: bytes, path: Path) -> dict[str, Any]:
-    def refuse(constant: str) -> None:
-        raise InputError(f"holds {constant}, which is no JSON.", file=path)
-
-    try:
-        document = json.loads(text.decode("utf-8"), parse_constant=refuse)
-    except json.JSONDecodeError as error:
-        place = f"line {error.lineno}, column {error.colno}"
-        raise InputError(f"is no JSON: {error.msg}.", file=path, place=place) from error
-    except (UnicodeDecodeError, RecursionError, ValueError) as error:
-        raise InputError(f"is no JSON text: {error}.", file=path) from error
-    schema = document.get("schema") if isinstance(document, dict) else None
-    found = re.fullmatch(r"meshreg\.registration/(\d{1,9})", str(schema))
-    if found is None:
-        raise InputError(
-            f'has schema {schema!r}; a registration has "{SCHEMA}".',
-            file=path,
-            remedy="Give the registration.json that `meshreg register` wrote.",
-        )
-    if found[1] != SCHEMA.rpartition("/")[2]:
-        raise InputError(
-            f"has schema {schema}; this meshreg reads {SCHEMA}.",
-            file=path,
-            remedy="Use the version of meshreg that wrote it, or a newer one.",
-        )
-    assert isinstance(document, dict)
-    return document
+    if not reference.source or not moving.source:
+        return []
+    home = reference.source[0].frame
+    written: list[Path] = []
+    done: list[Any] = []
+    for source in moving.source:
+        start = source.frame
+        key = (start.axes.tolist(), start.shift.tolist(), start.file_crs)
+        if key in done:
+            continue
+        end = f"_{source.path.stem}" if done else ""
+        done.append(key)
+        if start.crs is not None and moving.crs is not None and start.crs != moving.crs:
+            start = replace(start, crs=moving.crs)
+        centre = to_file(start, moving.centre[None])[0]
+        matrix = make_mover(source, transform, home, centre=centre).matrix
+        for name, rows in (("transform", matrix), ("transform_inverse", np.linalg.inv(matrix))):
+            written.append(_write_text(folder / f"{name}{end}.txt", matrix_text(rows)))
+    return written
 
 
-def _registration(document: dict[str, Any], path: Path) -> Registration:
-    verdict = document["verdict"]
-    if verdict not in _VERDICTS:
-        raise InputError(f"has verdict {verdict!r}; expected one of {_VERDICTS}.", file=path)
-    try:
-        transform = _transform(document, path)
-        return Registration(
-            verdict=verdict,
-            reason=str(document["reason"]),
-            transform=transform,
-            covariance=document["covariance"],
-            estimates=tuple(_estimate(*item, path) for item in document["methods"].items()),
-            hypotheses=tuple(dict(item) for item in document["hypotheses"]),
-            before=_statistics(document["before"]),
-            after=_statistics(document["after"]),
-            reference=dict(document["reference"]),
-            moving=dict(document["moving"]),
-            settings=dict(document["settings"]),
-            versions=dict(document["versions"]),
-            seconds=dict(document["seconds"]),
-            notes=tuple(str(note) for note in document["notes"]),
-        )
-    except UsageError as error:  # a record refused at birth; here the file is to blame
-        raise InputError(f"contradicts itself: {error.message}", file=path) from error
+def matrix_text(matrix: Any) -> str:
+    """Return a 4×4 matrix as CloudCompare reads it: four lines of four numbers, fixed notation.
+
+    15 decimals: a rotation's 12th decimal is 6 µm at a UTM northing.
+    """
+    rows = np.asarray(matrix, float) + 0.0  # no negative zeros
+    return "".join(" ".join(f"{value:.15f}" for value in row) + "\n" for row in rows)
 
 
-def _transform(document: dict[str, Any], path: Path) -> Transform | None:
-    rows, pivot = document["transform"]["reference_from_moving"], document["transform"]["pivot"]
-    if rows is None:
+def reference_stand_in(registration: Registration) -> Survey | None:
+    """Return a survey of one point with the frame of the reference file, for `rewrite_survey`.
+
+    None for a record that does not tell the frame: moved files then keep their own.
+    """
+    entry = registration.reference
+    shift, axes = entry.get("shift"), entry.get("axes")
+    if shift is None or axes is None:
         return None
-    matrix, pivot = np.array(rows, float), np.array(pivot, float)
-    offset = np.array([document["offset"][key] for key in ("east", "north", "up")], float)
-    read = Transform.from_matrix(matrix, pivot)
-    # The offset is stated apart because the matrix carries it only to the digits that a
-    # translation at UTM size leaves.
-    transform = Transform(read.rotation, read.scale, offset, pivot)
-    tolerance = 1e-6 + 1e-12 * float(np.abs(matrix).max())
-    if not np.abs(read.offset - offset).max() <= tolerance:
-        raise InputError(
-            f"contradicts itself: its matrix moves the pivot by {read.offset.tolist()}, "
-            f"its offset says {offset.tolist()}.",
-            file=path,
-        )
-    return transform
-
-
-def _number(value: Any) -> float:
-    return float("nan") if value is None else float(value)
-
-
-def _statistics(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Give back NaN where a statistic could not be computed."""
-    return {key: _number(item) if key in _NUMBERS else item for key, item in values.items()}
-
-
-def _estimate(method: str, values: Mapping[str, Any], path: Path) -> OffsetEstimate:
-    if values["status"] not in _STATUSES:
-        status = values["status"]
-        raise InputError(f"methods.{method} has the unknown status {status!r}.", file=path)
-    east, north = values["offset"] or (None, None)
-    return OffsetEstimate(
-        method=method,
-        status=values["status"],
-        reason=str(values["reason"]),
-        east=_number(east),
-        north=_number(north),
-        sigma=values["covariance"],
-        score=_number(values["score"]),
-        gap=_number(values["gap"]),
-        overlap=_number(values["overlap"]),
-        seconds=_number(values["seconds"]),
+    frame = Frame(axes, shift, entry.get("file_crs"), entry.get("crs"))
+    name = (entry.get("path") or ["reference"])[0]
+    source = SourceFile(Path(name), "reference", frame)
+    return Survey(
+        entry.get("name") or "reference",
+        PointCloud(np.zeros((1, 3))),
+        crs=entry.get("crs"),
+        source=(source,),
     )

@@ -14,7 +14,7 @@ MAX_MATCHES = 400  # lines drawn; more would only be a smear
 
 
 def draw_matches(registration: Registration) -> Any:
-    """Matches of image features: both orthomosaics side by side, a line per match."""
+    """Draw matches of image features: both orthomosaics side by side, a line per match."""
     found = [e for e in registration.estimates if "reference_points" in e.evidence]
     reference = registration.evidence.get("reference_ortho")
     moving = registration.evidence.get("moving_ortho_before")
@@ -87,14 +87,12 @@ def draw_surface(estimate: OffsetEstimate) -> Any:
         score = score[::-1]
     if east[0] > east[-1]:
         score = score[:, ::-1]
-    low, high = np.nanpercentile(score, [0.5, 100])
-    picture = axes.imshow(
-        score, extent=ends, cmap="cividis", vmin=low, vmax=high, interpolation="nearest"
-    )
+    scale = _color_scale(estimate, score)
+    picture = axes.imshow(score, extent=ends, interpolation="nearest", **scale)
     axes.set_facecolor("#dddddd")
     figure.colorbar(picture, ax=axes, shrink=0.85, label="score")
     _mark_peak(axes, evidence.get("second"), style.SECOND, "second peak", "X")
-    _mark_peak(axes, evidence.get("best"), style.MOVING, "chosen", "P")
+    _mark_peak(axes, evidence.get("best"), style.MOVING, "best", "P")
     axes.axhline(0, color="white", linewidth=0.4, alpha=0.6)
     axes.axvline(0, color="white", linewidth=0.4, alpha=0.6)
     axes.set_xlabel("east to add to the moving survey [m]")
@@ -103,6 +101,15 @@ def draw_surface(estimate: OffsetEstimate) -> Any:
     if axes.get_legend_handles_labels()[0]:
         style.legend_below(axes)
     return figure
+
+
+def _color_scale(estimate: OffsetEstimate, score: Any) -> dict[str, Any]:
+    """Let the best score be bright, whether the measure is better high or low (the paper's c)."""
+    lowest, low, middle, high, highest = np.nanpercentile(score, [0, 1, 50, 99, 100])
+    better_low = math.isfinite(estimate.score) and estimate.score < middle
+    if better_low:
+        return {"cmap": "cividis_r", "vmin": lowest, "vmax": high}
+    return {"cmap": "cividis", "vmin": low, "vmax": highest}
 
 
 def _half_step(axis: Any) -> float:
@@ -119,7 +126,7 @@ def _mark_peak(axes: Any, peak: Any, color: str, label: str, marker: str) -> Non
 
 
 def _said(estimate: OffsetEstimate) -> str:
-    parts = [estimate.status]
+    parts: list[str] = [estimate.status]
     if math.isfinite(estimate.gap):
         parts.append(f"gap {estimate.gap:.1f}")
     if estimate.reason:
@@ -149,11 +156,10 @@ def draw_offsets(registration: Registration) -> Any:
         color, marker = style.METHOD_STYLES.get(estimate.method, ("#000000", "v"))
         name = style.method_name(estimate.method)
         _ellipse(axes, (estimate.east, estimate.north), estimate.sigma, color)
-        hollow = {} if estimate.status == "ok" else {"facecolors": "white"}
+        fill = color if estimate.status == "ok" else "white"  # hollow: do not lean on it
         axes.scatter(
             [estimate.east], [estimate.north], marker=marker, s=55, edgecolors=color,
-            **({"color": color} if not hollow else hollow), zorder=3,
-            label=f"{name} ({estimate.status})",
+            facecolors=fill, zorder=3, label=f"{name} ({estimate.status})",
         )  # fmt: skip
     if registration.transform is not None:
         east, north = (float(value) for value in registration.transform.offset[:2])

@@ -11,7 +11,7 @@ from meshreg.types import Registration, SurveyRaster
 
 
 def draw_relief(registration: Registration) -> Any:
-    """Relief of both surveys on each other, before and after (blue reference, red moving)."""
+    """Draw the relief of both surveys on each other, before and after."""
     evidence = registration.evidence
     stages = _stages(registration, "moving_dem")
     if "reference_dem" not in evidence or not stages:
@@ -23,7 +23,7 @@ def draw_relief(registration: Registration) -> Any:
         4.9 * len(stages) + 0.5,
         tall + 1.4,
         "Relief of both surveys, lit from the north-west",
-        "grey: both agree    blue: reference alone    red: moving alone    pale: seen by one only",
+        "grey: both agree   blue: reference alone   orange: moving alone   pale: seen by one",
     )
     place = style.Place(grid)
     for index, (name, moving) in enumerate(stages):
@@ -37,7 +37,7 @@ def draw_relief(registration: Registration) -> Any:
 
 
 def draw_section(registration: Registration) -> Any:
-    """Heights of both surveys along a line from south to north through the overlap."""
+    """Draw the heights of both surveys along a line from south to north through the overlap."""
     evidence = registration.evidence
     stages = _stages(registration, "moving_dem")
     if "reference_dem" not in evidence or not stages:
@@ -53,7 +53,7 @@ def draw_section(registration: Registration) -> Any:
         9.5,
         4.2,
         f"Cross section at east {float(np.atleast_1d(east)[0]):.2f} m",
-        "south to the left; heights as they are, not exaggerated in the numbers",
+        "south to the left",
     )
     axes = figure.add_subplot()
     _profile(axes, north - place.north, reference, column, color=style.REFERENCE, label="reference")
@@ -73,7 +73,7 @@ def draw_section(registration: Registration) -> Any:
 
 
 def draw_orthos(registration: Registration) -> Any:
-    """Orthomosaics on each other before and after, and as a chequerboard."""
+    """Draw the orthomosaics on each other before and after, and as a chequerboard."""
     evidence = registration.evidence
     stages = _stages(registration, "moving_ortho")
     reference: SurveyRaster | None = evidence.get("reference_ortho")
@@ -89,7 +89,7 @@ def draw_orthos(registration: Registration) -> Any:
         4.3 * columns + 0.5,
         tall + 1.4,
         "Orthomosaics of both surveys",
-        "overlay: grey where both agree, blue reference alone, red moving alone",
+        "overlay: grey where both agree, blue reference alone, orange moving alone",
     )
     place = style.Place(grid)
     for index, (name, moving) in enumerate(stages):

@@ -11,10 +11,10 @@ from meshreg.types import Registration
 
 
 def draw_residuals(registration: Registration) -> Any:
-    """Offsets that are left in each tile, as arrows over the reference's relief."""
+    """Draw the offsets that are left in each tile, as arrows over the reference's relief."""
     field = registration.evidence.get("residuals")
     raster = registration.evidence.get("reference_dem")
-    if field is None or raster is None or len(np.atleast_1d(field["east"])) == 0:
+    if not field or raster is None or len(np.atleast_1d(field["east"])) == 0:
         return None
     east, north, d_east, d_north = (
         np.asarray(field[key], float) for key in ("east", "north", "d_east", "d_north")
@@ -58,7 +58,7 @@ def _round_length(value: float) -> float:
 
 
 def draw_height_difference(registration: Registration) -> Any:
-    """Registered minus reference heights: the map and how they are spread."""
+    """Draw registered minus reference heights: the map and how they are spread."""
     evidence = registration.evidence
     reference, moving = evidence.get("reference_dem"), evidence.get("moving_dem")
     if reference is None or moving is None:

@@ -41,13 +41,10 @@ for column, (name, title) in enumerate((("reference", "reference"), ("moving", "
     if surface.n_points:
         plotter.add_mesh(surface, scalars="color", rgb=True, ambient=0.25, specular=0.0)
     plotter.add_text(title, font_size=12, color="black")
-middle = [float(np.mean(data[k])) for k in ("east", "north")]
-span = max(float(np.ptp(data["east"])), float(np.ptp(data["north"])))
-top = float(np.nanmedian(data["reference"])) * float(data["exaggeration"])
 plotter.link_views()
-plotter.camera_position = [
-    (middle[0] - 0.5 * span, middle[1] - 1.25 * span, top + 0.95 * span), (*middle, top), (0, 0, 1)
-]
+plotter.view_vector((-0.45, -1.0, 0.9), viewup=(0, 0, 1))
+plotter.reset_camera()
+plotter.camera.zoom(1.25)
 plotter.screenshot(target)
 """
 

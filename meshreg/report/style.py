@@ -44,8 +44,7 @@ def new_figure(width: float, height: float, title: str, subtitle: str = "") -> A
     scale = min(1.0, MAX_PIXELS / DPI / max(width, height))
     figure = Figure(figsize=(width * scale, height * scale), dpi=DPI, layout="constrained")
     FigureCanvasAgg(figure)
-    text = f"{title}\n" if subtitle else title
-    figure.suptitle(text, fontsize=12, fontweight="bold", color=INK)
+    figure.suptitle(title, fontsize=12, fontweight="bold", color=INK)
     if subtitle:
         figure.supxlabel(subtitle, fontsize=9, color="#555555")
     return figure
@@ -136,7 +135,7 @@ def hillshade(height: Float64, cell: float) -> Float64:
 
 
 def two_tone(reference: Float64, moving: Float64) -> UInt8:
-    """Overlay two grey pictures (0-1, NaN = none): blue is reference alone, red moving alone.
+    """Overlay two grey pictures (0-1, NaN = none): blue is reference alone, orange moving alone.
 
     Where both are equally bright the picture is grey; a shift shows as coloured rims.
     """
@@ -163,13 +162,6 @@ def stretched(color: Float64) -> Float64:
 def over_white(color: Float64) -> UInt8:
     """(h, w, 3) uint8 of a colour picture, white where nothing was seen."""
     return np.asarray(np.round(255 * np.nan_to_num(np.clip(color, 0, 1), nan=1.0)), np.uint8)
-
-
-def scale_bar_length(span: float) -> float:
-    """A round length near a fifth of `span` [m]."""
-    raw = span / 5
-    power = 10.0 ** math.floor(math.log10(raw))
-    return float(max(step * power for step in (1, 2, 5) if step * power <= raw))
 
 
 def legend_below(axes: Any, handles: Sequence[Any] | None = None, columns: int = 3) -> None:

@@ -1,0 +1,5 @@
+"""`python -m meshreg`."""
+
+from meshreg.cli import main
+
+main()

@@ -1,0 +1,393 @@
+"""The command line: arguments in, exit codes out. Nothing else in the package prints.
+
+Exit codes: 0 accepted or done, 1 a bug, 2 usage, 3 bad input, 4 review or rejected, 5 resource
+limit, 6 output not written, 130 and 143 stopped by a signal.
+"""
+
+from __future__ import annotations
+
+import sys
+import traceback
+from collections.abc import Sequence
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from meshreg import __version__
+from meshreg.errors import MeshregError, UsageError
+
+if TYPE_CHECKING:
+    from meshreg.cli_parts.console import Voice
+
+# Typer carries its own click or uses the installed one; this is the root of its errors either way.
+_ClickError = typer.BadParameter.__mro__[2]
+
+app = typer.Typer(
+    name="meshreg",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="rich",
+    help="Register repeat surveys of the seafloor straight from structure-from-motion exports.",
+)
+
+
+class Axes(StrEnum):
+    """What a file's x, y, z are."""
+
+    enu = "enu"
+    ned = "ned"
+
+
+class Up(StrEnum):
+    """Which axis of a file points up."""
+
+    y = "y"
+    z = "z"
+
+
+class Preset(StrEnum):
+    """Methods as they work best, or exactly as published."""
+
+    robust = "robust"
+    paper = "paper"
+
+
+_SHIFT = "Add to its coordinates in metres; replaces a sidecar's shift."
+OutOption = Annotated[Path, typer.Option("--out", "-o", help="Folder for the result.")]
+AxesOption = Annotated[Axes | None, typer.Option(help="Axes of the file(s): enu, or ned (ACFR).")]
+UpOption = Annotated[Up | None, typer.Option(help="Axis of the file(s) that points up.")]
+UnitOption = Annotated[str | None, typer.Option(help="Unit of the file(s): m, cm, mm, ft, us-ft.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON document, nothing else.")]
+DebugOption = Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")]
+OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace a former result.")]
+SetOption = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="STAGE.NAME=VALUE", help="Any other setting; repeatable."),
+]
+ConfigOption = Annotated[
+    Path | None, typer.Option("--config", metavar="FILE.toml", help="Settings from a file.")
+]
+MaskOption = Annotated[
+    list[str] | None,
+    typer.Option("--mask", metavar="FILE", help="Raster or polygons: what to use; repeatable."),
+]
+ScaleOption = Annotated[
+    list[float] | None,
+    typer.Option(help="Metres per unit of a COLMAP model; give twice for reference and moving."),
+]
+PositionsOption = Annotated[
+    list[Path] | None,
+    typer.Option(help="Camera positions of a COLMAP model (CSV); twice for reference and moving."),
+]
+DemCellOption = Annotated[float | None, typer.Option(help="DEM cell in metres; from the data.")]
+OrthoCellOption = Annotated[
+    float | None, typer.Option(help="Mosaic cell in metres; from the data.")
+]
+
+
+@app.callback(invoke_without_command=True)
+def _root(
+    context: typer.Context,
+    version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False,
+) -> None:
+    if version:
+        typer.echo(f"meshreg {__version__}")
+        raise typer.Exit(0)
+    del context
+
+
+@app.command()
+def register(
+    reference: Annotated[str, typer.Argument(help="Original survey: file, folder or quoted glob.")],
+    moving: Annotated[str, typer.Argument(help="Repeat survey, laid on the reference.")],
+    out: OutOption,
+    reference_shift: Annotated[str | None, typer.Option(metavar="E,N,U", help=_SHIFT)] = None,
+    moving_shift: Annotated[str | None, typer.Option(metavar="E,N,U", help=_SHIFT)] = None,
+    axes: AxesOption = None,
+    up: UpOption = None,
+    unit: UnitOption = None,
+    mask: MaskOption = None,
+    search_radius: Annotated[
+        float | None, typer.Option(help="Largest offset east or north in metres; 10.")
+    ] = None,
+    dem_cell: DemCellOption = None,
+    ortho_cell: OrthoCellOption = None,
+    sift_cell: Annotated[
+        float | None, typer.Option(help="SIFT cell in metres; from the data.")
+    ] = None,
+    methods: Annotated[
+        str | None, typer.Option(help="Some of sift,terrain,mutual_information.")
+    ] = None,
+    preset: Annotated[Preset | None, typer.Option(help="robust, or paper as published.")] = None,
+    config: ConfigOption = None,
+    changes: SetOption = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of every random draw; 0.")] = None,
+    scale: ScaleOption = None,
+    positions: PositionsOption = None,
+    overwrite: OverwriteOption = False,
+    as_json: JsonOption = False,
+    debug: DebugOption = False,
+) -> int:
+    """Lay the MOVING (repeat) survey on the REFERENCE (original) one.
+
+    OUT receives the registered survey in its own format, the record with the verdict, both
+    surveys' maps on one grid, figures and log. Exit code 0: accepted; 4: review or rejected.
+
+    --axes, --up and --unit hold for both surveys; where they differ, say so in a
+    NAME.survey.toml beside each file.
+    """
+    del debug
+    from meshreg.cli_parts.common import SurveyRequest
+    from meshreg.cli_parts.registering import RegisterRequest
+
+    settings = join_settings(
+        preset,
+        config,
+        changes,
+        {
+            "search.radius": search_radius,
+            "raster.dem_cell": dem_cell,
+            "raster.ortho_cell": ortho_cell,
+            "raster.sift_cell": sift_cell,
+            "methods": methods,
+            "seed": seed,
+        },
+    )
+    scales, places = for_both("--scale", scale), for_both("--positions", positions)
+    shared = {"axes": axes, "up": up, "unit": unit}
+    options = [
+        read_options(shift, name, **shared, scale=scales[k], positions=places[k])
+        for k, (shift, name) in enumerate(
+            ((reference_shift, "--reference-shift"), (moving_shift, "--moving-shift"))
+        )
+    ]
+    request = RegisterRequest(
+        SurveyRequest(reference, options[0]),
+        SurveyRequest(moving, options[1]),
+        out,
+        tuple(mask or ()),
+        settings,
+        overwrite,
+    )
+    return _do_register(request, _voice(as_json))
+
+
+def _do_register(request: Any, voice: Voice) -> int:
+    from meshreg.cli_parts import registering, result
+    from meshreg.cli_parts.guard import run_stoppable
+    from meshreg.io.document import registration_document
+
+    registration = run_stoppable(
+        lambda unfinished: registering.register(request, voice, unfinished)
+    )
+    if voice.as_json:
+        voice.document(registration_document(registration))
+    else:
+        result.show(registration, request.out, voice)
+    return 0 if registration.verdict == "accepted" else 4
+
+
+@app.command()
+def rasterize(
+    survey: Annotated[str, typer.Argument(help="File, folder or quoted glob.")],
+    out: OutOption,
+    shift: Annotated[str | None, typer.Option(metavar="E,N,U", help=_SHIFT)] = None,
+    axes: AxesOption = None,
+    up: UpOption = None,
+    unit: UnitOption = None,
+    mask: MaskOption = None,
+    dem_cell: DemCellOption = None,
+    ortho_cell: OrthoCellOption = None,
+    scale: Annotated[float | None, typer.Option(help="Metres per unit of a COLMAP model.")] = None,
+    positions: Annotated[Path | None, typer.Option(help="Its camera positions (CSV).")] = None,
+    config: ConfigOption = None,
+    changes: SetOption = None,
+    overwrite: OverwriteOption = False,
+    as_json: JsonOption = False,
+    debug: DebugOption = False,
+) -> int:
+    """Turn a survey into a DEM and an orthomosaic (GeoTIFF, cloud-optimized)."""
+    del debug
+    from meshreg.cli_parts import mapping
+    from meshreg.cli_parts.common import SurveyRequest
+    from meshreg.cli_parts.guard import run_stoppable
+
+    cells = {"raster.dem_cell": dem_cell, "raster.ortho_cell": ortho_cell}
+    settings = join_settings(None, config, changes, cells)
+    options = read_options(
+        shift, "--shift", axes=axes, up=up, unit=unit, scale=scale, positions=positions
+    )
+    request = mapping.RasterizeRequest(
+        SurveyRequest(survey, options), out, tuple(mask or ()), settings, overwrite
+    )
+    voice = _voice(as_json)
+    document = run_stoppable(lambda unfinished: mapping.rasterize(request, voice, unfinished))
+    if as_json:
+        voice.document(document)
+    else:
+        mapping.show_maps(document, voice)
+    return 0
+
+
+@app.command()
+def apply(
+    registration: Annotated[Path, typer.Argument(help="registration.json, or its folder.")],
+    survey: Annotated[str, typer.Argument(help="Any further file of the same moving survey.")],
+    out: OutOption,
+    shift: Annotated[str | None, typer.Option(metavar="E,N,U", help=_SHIFT)] = None,
+    axes: AxesOption = None,
+    up: UpOption = None,
+    unit: UnitOption = None,
+    overwrite: OverwriteOption = False,
+    as_json: JsonOption = False,
+    debug: DebugOption = False,
+) -> int:
+    """Move any further file of the same survey by a registration that was found."""
+    del debug
+    from meshreg.cli_parts import applying
+    from meshreg.cli_parts.common import SurveyRequest
+    from meshreg.cli_parts.guard import run_stoppable
+
+    options = read_options(shift, "--shift", axes=axes, up=up, unit=unit)
+    request = applying.ApplyRequest(registration, SurveyRequest(survey, options), out, overwrite)
+    voice = _voice(as_json)
+    document = run_stoppable(lambda unfinished: applying.apply(request, voice, unfinished))
+    if as_json:
+        voice.document(document)
+    else:
+        applying.show_applied(document, voice)
+    return 0
+
+
+@app.command()
+def info(
+    survey: Annotated[str, typer.Argument(help="File, folder or quoted glob.")],
+    shift: Annotated[str | None, typer.Option(metavar="E,N,U", help=_SHIFT)] = None,
+    axes: AxesOption = None,
+    up: UpOption = None,
+    unit: UnitOption = None,
+    as_json: JsonOption = False,
+    debug: DebugOption = False,
+) -> int:
+    """Say what is in a survey: counts, bounds, spacing, textures, CRS, up axis and unit."""
+    del debug
+    from meshreg.cli_parts import info as describing
+    from meshreg.cli_parts.common import SurveyRequest, read
+    from meshreg.cli_parts.guard import run_stoppable
+
+    options = read_options(shift, "--shift", axes=axes, up=up, unit=unit)
+    request = SurveyRequest(survey, options)
+    voice = _voice(as_json)
+    document = run_stoppable(lambda unfinished: describing.describe(read(request)))
+    if as_json:
+        voice.document(document)
+    else:
+        describing.show(document, voice)
+    return 0
+
+
+@app.command()
+def doctor(as_json: JsonOption = False, debug: DebugOption = False) -> int:
+    """Say what this machine lacks, and the command that brings it."""
+    del debug
+    from meshreg.cli_parts import machine
+    from meshreg.cli_parts.guard import run_stoppable
+    from meshreg.doctor import examine
+
+    voice = _voice(as_json)
+    checks = run_stoppable(lambda unfinished: examine())
+    if as_json:
+        voice.document(machine.document(checks))
+    else:
+        machine.show(checks, voice)
+    return 0 if all(check.state != "missing" for check in checks) else 5
+
+
+@app.command()
+def demo(
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the result.")] = Path(
+        "meshreg_demo"
+    ),
+    overwrite: OverwriteOption = False,
+    as_json: JsonOption = False,
+    debug: DebugOption = False,
+) -> int:
+    """Do the main job on a small pair of surveys that travels with the package."""
+    del debug
+    from meshreg.cli_parts.registering import demo_request
+
+    voice = _voice(as_json)
+    request = demo_request(out, overwrite)
+    voice.say("Two drone surveys of one beach, eight months apart; the second lies wrong by")
+    voice.say("east −13.4 m, north +8.7 m, up −1.25 m. It is laid back:")
+    return _do_register(request, voice)
+
+
+def _voice(as_json: bool) -> Voice:
+    from meshreg.cli_parts.console import Voice
+
+    return Voice(as_json)
+
+
+def run(arguments: Sequence[str]) -> int:
+    """Run one command; return its exit code."""
+    as_json, debug = "--json" in arguments, "--debug" in arguments
+    try:
+        code = app(list(arguments), prog_name="meshreg", standalone_mode=False)
+    except BrokenPipeError:
+        sys.stderr.close()  # nobody listens any more; keep the interpreter from complaining
+        return 0
+    except BaseException as error:
+        return _failed(error, as_json, debug)
+    return int(code or 0)
+
+
+def _failed(error: BaseException, as_json: bool, debug: bool) -> int:
+    """Say what went wrong in one line; the traceback only where it was asked for."""
+    from meshreg.cli_parts.common import out_of_memory
+    from meshreg.cli_parts.guard import StoppedError
+
+    if isinstance(error, SystemExit | typer.Exit | typer.Abort):
+        code = getattr(error, "exit_code", getattr(error, "code", 1))
+        return code if isinstance(code, int) else 1
+    voice = _voice(as_json)
+    if debug and not isinstance(error, _ClickError):
+        voice.err.print("".join(traceback.format_exception(error)), markup=False)
+    if isinstance(error, KeyboardInterrupt | StoppedError):
+        voice.err.print("Stopped; nothing was written.")
+        return error.exit_code if isinstance(error, StoppedError) else 130
+    if isinstance(error, MemoryError):
+        error = out_of_memory(error)
+    if isinstance(error, MeshregError):
+        voice.error(error)
+        return error.exit_code
+    if isinstance(error, _ClickError):
+        return _usage(error, voice)
+    bug = MeshregError(
+        f"internal error: {type(error).__name__}: {error}",
+        remedy="This is a bug in meshreg. Please report it with what --debug shows.",
+    )
+    voice.error(bug)
+    return 1
+
+
+def _usage(error: Any, voice: Voice) -> int:
+    if voice.as_json:
+        voice.error(UsageError(error.format_message(), remedy="See meshreg --help."))
+    else:
+        from typer import rich_utils
+
+        rich_utils.rich_format_error(error)
+    return int(error.exit_code)
+
+
+def main() -> None:
+    """Entry point of the command `meshreg`."""
+    sys.exit(run(sys.argv[1:]))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,122 @@
+"""What the jobs of the command line share: surveys as named, new folders, masks, limits."""
+
+from __future__ import annotations
+
+import logging
+import os
+import shutil
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from meshreg.errors import OutputError, ResourceLimitError
+
+if TYPE_CHECKING:
+    from meshreg.cli_parts.guard import Unfinished
+    from meshreg.io.options import ReadOptions
+    from meshreg.types import Survey
+
+LOG = logging.getLogger("meshreg")
+Mask = Callable[[Any], Any]
+_ROOM = 200e6  # bytes wanted on the disk beside the copies of the moving survey's files
+
+
+@dataclass(frozen=True)
+class SurveyRequest:
+    """A survey as the user names it, with what they say about it."""
+
+    path: str
+    options: ReadOptions
+
+
+@contextmanager
+def new_folder(out: Path, overwrite: bool, unfinished: Unfinished, marker: str) -> Iterator[Path]:
+    """Give a temporary folder that becomes `out` when the block ends well.
+
+    That the folder can be written and the disk is not full is found out here, before the work.
+    """
+    from meshreg.io.atomic import as_output_error, atomic_folder
+
+    with as_output_error(out):
+        out.absolute().parent.mkdir(parents=True, exist_ok=True)
+    with atomic_folder(out, overwrite, (marker,)) as folder, unfinished.holding(folder):
+        yield folder
+
+
+def require_disk(folder: Path, survey: Survey | None) -> None:
+    """Refuse, with numbers, before the work if the disk cannot take the result."""
+    wanted = _ROOM
+    if survey is not None:
+        files = [p for source in survey.source for p in (source.path, *source.companions)]
+        wanted += 1.2 * sum(path.stat().st_size for path in set(files) if path.is_file())
+    free = shutil.disk_usage(folder).free
+    if free < wanted:
+        raise OutputError(
+            f"has {free / 1e6:.0f} MB free; the result may take {wanted / 1e6:.0f} MB.",
+            file=folder.parent,
+            remedy="Free some disk, or choose another place with -o.",
+        )
+
+
+def read(request: SurveyRequest, name: str = "") -> Survey:
+    """Read one survey and log what was found."""
+    from meshreg.io import read_survey
+
+    survey = read_survey(request.path, request.options)
+    LOG.info("%s: %s from %s", name or "survey", survey.name, request.path)
+    for note in survey.notes:
+        LOG.info("%s: %s", survey.name, note)
+    return survey
+
+
+def read_masks(said: Sequence[str], crs: str | None) -> dict[str, Mask | None]:
+    """Read the masks of each survey, written `[reference:|moving:][not:]FILE`.
+
+    A mask holds for the reference unless it says `moving:`: at the right offset that is enough,
+    because only ground that both surveys show is compared. `not:` leaves out what is inside.
+    """
+    from meshreg.io.masks import read_mask
+
+    found: dict[str, list[Callable[[Any], Any]]] = {"reference": [], "moving": []}
+    for text in said:
+        which, name, invert = "reference", text, False
+        while (parts := name.partition(":"))[0] in ("reference", "moving", "not") and parts[2]:
+            if parts[0] == "not":
+                invert = not invert
+            else:
+                which = parts[0]
+            name = parts[2]
+        found[which].append(read_mask(name, invert, crs))
+        LOG.info("mask of the %s: %s%s", which, "all but " if invert else "", name)
+    return {which: _every(masks) for which, masks in found.items()}
+
+
+def _every(masks: list[Callable[[Any], Any]]) -> Mask | None:
+    """Return the mask that uses what all of them use; None where there is none."""
+    if len(masks) < 2:
+        return masks[0] if masks else None
+
+    def used(grid: Any) -> Any:
+        return np.logical_and.reduce([mask(grid) for mask in masks])
+
+    return used
+
+
+def out_of_memory(error: MemoryError) -> ResourceLimitError:
+    """Say a MemoryError as the resource limit that it is."""
+    said = f" ({error})" if str(error) else ""
+    return ResourceLimitError(
+        f"There was not enough memory{said}; this machine has {_memory():.1f} GB.",
+        remedy="Use coarser cells (--dem-cell, --ortho-cell, --sift-cell) or a larger machine.",
+    )
+
+
+def _memory() -> float:
+    try:
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9
+    except (ValueError, OSError):
+        return float("nan")

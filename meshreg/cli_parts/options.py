@@ -1,0 +1,59 @@
+"""From the words of the command line to settings and read options."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from meshreg.errors import UsageError
+from meshreg.io.options import ReadOptions
+from meshreg.settings import Settings, read_settings
+
+
+def join_settings(
+    preset: str | None,
+    config: Path | None,
+    changes: Sequence[str] | None,
+    named: Mapping[str, Any],
+) -> Settings:
+    """Join preset, then file, then named options, then --set."""
+    settings = Settings.from_preset(preset or "robust")
+    if config is not None:
+        settings = read_settings(config, settings)
+        if preset is not None and settings.preset != preset:
+            raise UsageError(
+                f"--preset is {preset}, but the file says {settings.preset}.", file=config
+            )
+    said = {key: value for key, value in named.items() if value is not None}
+    for change in changes or ():
+        key, equals, value = change.partition("=")
+        if not equals:
+            raise UsageError(f"--set {change!r} has no '='.", remedy="Write stage.name=value.")
+        said[key.strip()] = value.strip()
+    return settings.changed(said)
+
+
+def read_options(shift: str | None, name: str, **said: Any) -> ReadOptions:
+    """Return what the user says of a survey; `name` is the option that gave the shift."""
+    return ReadOptions(shift=None if shift is None else _triple(shift, name), **said)
+
+
+def _triple(text: str, name: str) -> tuple[float, float, float]:
+    try:
+        east, north, up = (float(part) for part in text.split(","))
+    except ValueError:
+        raise UsageError(
+            f"{name} is {text!r}; it needs three numbers.",
+            remedy=f"Write {name} 731000,5705000,0 (east, north, up in metres).",
+        ) from None
+    return east, north, up
+
+
+def for_both(name: str, values: Sequence[Any] | None) -> tuple[Any, Any]:
+    """One value holds for both surveys; two are the reference's and the moving survey's."""
+    if not values:
+        return None, None
+    if len(values) > 2:
+        raise UsageError(f"{name} was given {len(values)} times; once or twice is meant.")
+    return values[0], values[-1]
