@@ -70,11 +70,15 @@ def _massive(f, dx, dy, base, finest):
     rho = ragged_radius(f, dx, dy, 0.07, finest)
     if rho >= 1.0:
         return NOTHING, 0.0
-    cell = 0.16 + 0.25 * f.radius
-    up, own = lumps(dx / cell, dy / cell, f.seed + 5, 1.0)
+    cell = 0.10 + 0.18 * f.radius
+    up, _ = lumps(dx / cell, dy / cell, f.seed + 5, 1.0)
+    swell = octaves(dx, dy, f.seed + 8, 0.9 * f.radius, finest, 0.5, 3)
+    folds = 0.0  # meandering valleys, as brain corals have
+    if f.seed % 3 == 0:
+        folds = 1.0 - min(1.0, 2.5 * abs(octaves(dx, dy, f.seed + 9, 0.055, finest, 0.4, 2)))
     dome = math.sqrt(1.0 - rho * rho)
-    z = base + f.height * dome * (1.15 - 0.15 * dome) + 0.22 * cell * up * dome
-    return z, 0.35 + 0.3 * up + 0.35 * own
+    z = base + f.height * dome * (1.15 - 0.15 * dome + 0.06 * swell) + 0.10 * cell * up * dome
+    return z - 0.004 * folds, 0.50 + 0.10 * up + 0.08 * swell + 0.10 * dome - 0.28 * folds
 
 
 @jit(nogil=True)
@@ -173,9 +177,9 @@ def _white(f, r, g, b, light):
     share = f.bleached
     tone = 0.40 + 0.26 * light
     return (
-        r + share * (tone * 0.98 - r),
+        r + share * (tone * 1.02 - r),
         g + share * (tone * 0.96 - g),
-        b + share * (tone * 0.88 - b),
+        b + share * (tone * 0.80 - b),
     )
 
 

@@ -98,16 +98,16 @@ def _sampled(take: Take, snap: float, step: float) -> Sampled:
     lattice = Lattice(
         left * snap - start[0] + step / 2, high * snap - start[1] - step / 2, step, shape
     )
-    up, color = take.sample(lattice)
+    view = take.sample(lattice)
     kept = take.margin_lattice(lattice) > 0
-    up32 = up.astype(np.float32)
+    up = view.up
     sigma = take.sfm.smoothing * take.sfm.mesh_spacing / step
     if sigma > 0.3:
-        up32 = cv2.GaussianBlur(up32, (0, 0), sigma)
+        up = cv2.GaussianBlur(up, (0, 0), sigma)
     if take.sfm.vertex_noise > 0:
-        up32 += take.height_noise(*np.meshgrid(lattice.east, lattice.norths)).astype(np.float32)
+        up = up + take.height_noise(*np.meshgrid(lattice.east, lattice.norths)).astype(np.float32)
     grid = Grid(left * snap, high * snap, step, shape, None)
-    return grid, up32, color, kept
+    return grid, up, view.color, kept
 
 
 def _average(take: Take, sampled: Sampled, per_cell: int, cell: float) -> SurveyRaster:

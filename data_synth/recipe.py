@@ -40,6 +40,8 @@ class Output:
     pages: int = 2  # texture pages along each side
     point_spacing: float = 0.02  # of point clouds
     format: str = "obj"
+    tracks: int = 4  # of cameras, for photographs
+    images: int = 5  # on each track
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -19,6 +20,27 @@ Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 UInt8 = NDArray[np.uint8]
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A lattice of one survey, without holes or noise.
+
+    Attributes
+    ----------
+    lattice : Lattice
+        Centred coordinates.
+    up : (H, W) float32
+        Height in the survey's own frame, centred [m].
+    color : (H, W, 3) uint8
+    winner : (H, W) int32
+        Number of the feature on top, -1 for the ground.
+    """
+
+    lattice: Lattice
+    up: Float32
+    color: UInt8
+    winner: NDArray[np.int32]
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,9 +101,10 @@ class Take:
 
         from data_synth.sfm_kernels import lattice_height, lattice_to_world
 
-        step = max(0.10, abs(float(east[-1] - east[0])) / 1000.0)
-        e = np.arange(east.min() - step, east.max() + 2 * step, step)
-        n = np.arange(north.max() + step, north.min() - 2 * step, -step)
+        step = 0.10
+        # whole multiples of the step, so that the strips of one survey meet without a seam
+        e = np.arange(math.floor(east.min() / step) - 1, math.ceil(east.max() / step) + 2) * step
+        n = np.arange(math.ceil(north.max() / step) + 1, math.floor(north.min() / step) - 2, -1) * step
         guess = np.zeros((len(n), len(e)))
         linear, warp = self.distortion.linear, self.distortion.warp
         for _ in range(2):
@@ -94,17 +117,29 @@ class Take:
         )
         return fine
 
-    def sample(self, lattice: Lattice) -> tuple[Float64, UInt8]:
-        """Return height in the survey's frame (H, W) [m, centred] and the mosaic (H, W, 3)."""
+    def sample(
+        self, lattice: Lattice, progress: Callable[[float], None] | None = None
+    ) -> View:
+        """Return what the survey shows of a lattice: worked in strips, to spare memory."""
         from data_synth.sfm_kernels import lattice_height
 
+        rows, cols = lattice.shape
         east, north = lattice.east, lattice.norths
-        x, y, lift = self.world(east, north)
-        height, albedo, _ = self.seafloor.evaluate(x, y, 1.5 * lattice.step)
+        up, height = np.empty((rows, cols), np.float32), np.empty((rows, cols), np.float32)
+        albedo = np.empty((rows, cols, 3), np.float32)
+        winner = np.empty((rows, cols), np.int32)
+        strip = max(1, 1_000_000 // cols)
+        for top in range(0, rows, strip):
+            part = slice(top, min(rows, top + strip))
+            x, y, lift = self.world(east, north[part])
+            z, albedo[part], winner[part] = self.seafloor.evaluate(x, y, 1.5 * lattice.step)
+            height[part] = z
+            up[part] = lattice_height(z, lift, east, north[part], self.distortion.linear)
+            if progress is not None:
+                progress(part.stop / rows)
         mirror = bool(np.linalg.det(self.distortion.linear) < 0)
-        color = see(height.astype(np.float32), albedo, lattice, self.seeing, self.plan, mirror)
-        up: Float64 = lattice_height(height, lift, east, north, self.distortion.linear)
-        return up, color
+        color = see(height, albedo, lattice, self.seeing, self.plan, mirror)
+        return View(lattice, up, color, winner)
 
     def margin(self, east: Float64, north: Float64) -> Float64:
         """How far centred points (any one shape) are inside what was reconstructed.

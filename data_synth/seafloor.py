@@ -251,7 +251,7 @@ SITES: dict[str, Site] = {
     "boulders": replace(
         Site(), relief=0.12, step=0.0, lump=0.05, lump_gain=0.5, boulder=1.1, massive=0.0, branching=0.0,
         plate=0.0, encrusting=1.2, soft=0.3, sponge=0.8, urchin=0.8, kelp=0.15, sand=0.25,
-        tone=(0.75, 0.72, 0.68), sand_tone=(0.36, 0.33, 0.27), coralline=0.9, rubble=0.35,
+        tone=(0.78, 0.72, 0.62), sand_tone=(0.36, 0.33, 0.27), coralline=0.45, rubble=0.35,
     ),
     "reef_and_sand": replace(Site(), sand=0.45, step=0.35, step_level=0.3, massive=0.9),
     "sand": replace(

@@ -40,7 +40,9 @@ def surface_at(x, y, ground, features, starts, members, corner, bins, finest, wi
             dust = max(dust, share)
         elif f.kind == TURF:
             share = _laid(f, x, y, finest)
-            z += f.height * share * (1.0 - sandy)
+            if share > 0.0:
+                tuft = octaves(x, y, ground.seed + 80, 0.06, finest, 0.75, 4)
+                z += f.height * share * (1.0 - sandy) * (1.0 + 0.25 * tuft)
             turf = max(turf, share)
     top, winner = z, -1
     red, green, blue, rocky = 0.0, 0.0, 0.0, True
@@ -63,10 +65,12 @@ def surface_at(x, y, ground, features, starts, members, corner, bins, finest, wi
     elif winner < 0:
         red, green, blue = rock_color(x, y, ground, shade, cover, finest)
         if turf > 0.0:
-            light = 0.5 + 0.5 * shade
-            red += turf * (0.085 * light - red)
-            green += turf * (0.095 * light - green)
-            blue += turf * (0.040 * light - blue)
+            tuft = octaves(x, y, ground.seed + 80, 0.06, finest, 0.75, 4)
+            clump = octaves(x, y, ground.seed + 81, 0.5, finest, 0.6, 2)
+            light = (0.5 + 0.5 * shade) * (1.0 + 0.22 * tuft + 0.15 * clump)
+            red += turf * ((0.085 + 0.012 * clump) * light - red)
+            green += turf * (0.085 * light - green)
+            blue += turf * (0.038 * light - blue)
         share = max(sandy, 0.92 * dust)
         if share > 0.0:
             r, g, b = sand_color(x, y, ground, crest if sandy > 0.5 else 0.5, finest)

@@ -26,10 +26,10 @@ class Seeing:
     """
 
     altitude: float = 2.0
-    sun: float = 0.6
+    sun: float = 0.9
     sun_azimuth: Drawn = (0.0, 360.0)
     sun_elevation: Drawn = (45.0, 75.0)
-    ambient: float = 0.5
+    ambient: float = 0.4
     strobe: float = 0.25
     strobe_arm: float = 0.7
     strobe_balance: float = 0.6

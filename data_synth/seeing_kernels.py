@@ -59,6 +59,70 @@ def shadow(z, i, j, step, east, north, rise):
     return light
 
 
+@jit(nogil=True)
+def light_at(z, soft, wide, i, j, step, x, y, mirror, away, high, image, plan):
+    """Light on sample (i, j) at centred (x, y): sky, sun and the lamps beside the camera.
+
+    `away` is the sample's (east, north) from the camera [m], `high` the camera's height above the
+    ground around, `image` a number pair that tells images apart.
+    """
+    rows, cols = z.shape
+    up, down, left, right = max(i - 1, 0), min(i + 1, rows - 1), max(j - 1, 0), min(j + 1, cols - 1)
+    gx = (z[i, right] - z[i, left]) / ((right - left) * step)
+    gy = (z[up, j] - z[down, j]) / ((down - up) * step)
+    norm = 1.0 / math.sqrt(1.0 + gx * gx + gy * gy)
+    # crevices and hollows see less of the sky
+    near = min(1.2, max(0.28, 1.0 + plan.crevice * (z[i, j] - soft[i, j])))
+    around = min(1.15, max(0.4, 1.0 + 0.2 * plan.crevice * (z[i, j] - wide[i, j])))
+    light = plan.ambient * near * around * (0.5 + 0.5 * norm)
+    if plan.sun > 0.0:
+        sun_x, sun_y = math.sin(plan.azimuth) * mirror, math.cos(plan.azimuth)
+        lie, rise = math.cos(plan.elevation), math.sin(plan.elevation)
+        sun = (rise - lie * (gx * sun_x + gy * sun_y)) * norm
+        if sun > 0.0:
+            sun *= shadow(z, i, j, step, sun_x, sun_y, rise / lie)
+            light += plan.sun * sun * min(1.0, near + 0.2)
+    if plan.caustics > 0.0:
+        salt = plan.seed + 31 * image[0] + 17 * image[1]
+        a = abs(gradient_noise(x * 5.0, y * 5.0, salt))
+        b = abs(gradient_noise(x * 7.7 + 3.0, y * 7.7, salt + 9))
+        light *= 1.0 + plan.caustics * (1.5 * math.exp(-22.0 * min(a, b)) - 0.45)
+    if plan.strobe > 0.0:
+        # a pair of lamps fore and aft of the camera and a little to one side
+        c, s = math.cos(plan.heading), math.sin(plan.heading)
+        flash = 0.0
+        for k in range(2):
+            along = plan.strobe_arm if k == 0 else -plan.strobe_arm
+            across = 0.25 * along
+            ex, ey = c * along - s * across - away[0], s * along + c * across - away[1]
+            ez = high - (z[i, j] - wide[i, j])
+            far = math.sqrt(ex * ex + ey * ey + ez * ez)
+            face = (ez - gx * ex - gy * ey) * norm / far
+            if face <= 0.0:
+                continue
+            power = face if k == 0 else plan.strobe_balance * face
+            flat = math.sqrt(ex * ex + ey * ey)
+            if flat > 0.05:
+                power *= shadow(z, i, j, step, ex / flat, ey / flat, ez / flat)
+            flash += power * (ez / far) ** 4 * (high / far) ** 2
+        light += plan.strobe * flash * min(1.0, near + 0.2)
+    return light
+
+
+@jit(nogil=True)
+def through_water(albedo, light, view, high, image, plan, out):
+    """Put what a camera at distance `view` [m] sees of a lit spot into `out` (3,)."""
+    edge = (high / view) ** (4.0 * plan.vignette)
+    gain = edge * (1.0 + plan.seams * (2.0 * hash01(image[0], image[1], plan.seed + 7) - 1.0))
+    attenuation = (plan.attenuation_red, plan.attenuation_green, plan.attenuation_blue)
+    haze = (plan.haze_red, plan.haze_green, plan.haze_blue)
+    for k in range(3):
+        clear = math.exp(-attenuation[k] * (view - plan.altitude * plan.corrected))
+        veil = haze[k] * (1.0 - math.exp(-attenuation[k] * view))
+        tint = 1.0 + 0.5 * plan.seams * (hash01(image[0], image[1], plan.seed + 8 + k) - 0.5)
+        out[k] = (albedo[k] * light * clear + veil) * gain * tint
+
+
 @jit(parallel=True, nogil=True)
 def radiance(z, soft, wide, albedo, step, west, north, mirror, plan):
     """Linear colour (H, W, 3) f32 that the cameras saw of a lattice of the seafloor.
@@ -76,61 +140,17 @@ def radiance(z, soft, wide, albedo, step, west, north, mirror, plan):
     """
     rows, cols = z.shape
     out = np.empty((rows, cols, 3), np.float32)
-    sun_x, sun_y = math.sin(plan.azimuth), math.cos(plan.azimuth)
-    lie, rise = math.cos(plan.elevation), math.sin(plan.elevation)
-    attenuation = (plan.attenuation_red, plan.attenuation_green, plan.attenuation_blue)
-    haze = (plan.haze_red, plan.haze_green, plan.haze_blue)
     c, s = math.cos(plan.heading), math.sin(plan.heading)
     for i in prange(rows):
-        up, down = max(i - 1, 0), min(i + 1, rows - 1)
         y = north - i * step
         for j in range(cols):
-            left, right = max(j - 1, 0), min(j + 1, cols - 1)
-            gx = (z[i, right] - z[i, left]) / ((right - left) * step)
-            gy = (z[up, j] - z[down, j]) / ((down - up) * step)
-            norm = 1.0 / math.sqrt(1.0 + gx * gx + gy * gy)
             x = west + j * step
             da, dc, na, nc, high = nearest_camera(x, y, plan)
-            # crevices see less of the sky
-            near = min(1.2, max(0.25, 1.0 + plan.crevice * (z[i, j] - soft[i, j])))
-            around = min(1.15, max(0.4, 1.0 + 0.2 * plan.crevice * (z[i, j] - wide[i, j])))
-            open_sky = near * around * (0.5 + 0.5 * norm)
-            light = plan.ambient * open_sky
-            if plan.sun > 0.0:
-                sun = max(0.0, (rise - lie * (gx * sun_x * mirror + gy * sun_y)) * norm)
-                if sun > 0.0:
-                    sun *= shadow(z, i, j, step, sun_x * mirror, sun_y, rise / lie)
-                light += plan.sun * sun * min(1.0, near + 0.2)
-            if plan.caustics > 0.0:
-                salt = plan.seed + 31 * na + 17 * nc
-                a = abs(gradient_noise(x * 5.0, y * 5.0, salt))
-                b = abs(gradient_noise(x * 7.7 + 3.0, y * 7.7, salt + 9))
-                light *= 1.0 + plan.caustics * (1.5 * math.exp(-22.0 * min(a, b)) - 0.45)
-            if plan.strobe > 0.0:
-                # a pair of strobes fore and aft of the camera, the fore one stronger
-                flash = 0.0
-                for k in range(2):
-                    arm = plan.strobe_arm if k == 0 else -plan.strobe_arm
-                    la, lc, lz = arm - da, 0.25 * arm - dc, high - (z[i, j] - soft[i, j])
-                    ex, ey = c * la - s * lc, s * la + c * lc
-                    far = math.sqrt(la * la + lc * lc + lz * lz)
-                    face = (lz - gx * ex - gy * ey) * norm / far
-                    beam = (lz / far) ** 4
-                    power = (1.0 if k == 0 else plan.strobe_balance) * max(0.0, face)
-                    flat = math.sqrt(ex * ex + ey * ey)
-                    if power > 0.0 and flat > 0.05:
-                        power *= shadow(z, i, j, step, ex / flat, ey / flat, lz / flat)
-                    flash += power * beam * (high / far) ** 2
-                light += plan.strobe * flash * min(1.0, near + 0.2)
+            away = (c * da - s * dc, s * da + c * dc)
+            light = light_at(z, soft, wide, i, j, step, x, y, mirror, away, high, (na, nc), plan)
             view = math.sqrt(da * da + dc * dc + high * high)
-            edge = (high / view) ** (4.0 * plan.vignette)
-            gain = 1.0 + plan.seams * (2.0 * hash01(na, nc, plan.seed + 7) - 1.0)
-            path = view - plan.altitude * plan.corrected
-            for k in range(3):
-                clear = math.exp(-attenuation[k] * path)
-                veil = haze[k] * (1.0 - math.exp(-attenuation[k] * view))
-                tint = 1.0 + 0.5 * plan.seams * (hash01(na, nc, plan.seed + 8 + k) - 0.5)
-                out[i, j, k] = (albedo[i, j, k] * light * clear + veil) * gain * edge * tint
+            color = (albedo[i, j, 0], albedo[i, j, 1], albedo[i, j, 2])
+            through_water(color, light, view, high, (na, nc), plan, out[i, j])
     return out
 
 
@@ -163,4 +183,20 @@ def blotches(x, y, seed, wavelength, count):
     out = np.empty(x.size)
     for i in prange(x.size):
         out[i] = octaves(x[i], y[i], seed, wavelength, 0.0, 0.65, count)
+    return out
+
+
+@jit(parallel=True, nogil=True)
+def bilinear(raster, row, col):
+    """Values (N,) of a raster (H, W) between its samples; beyond the border the border's."""
+    rows, cols = raster.shape
+    out = np.empty(row.size)
+    for k in prange(row.size):
+        r = min(max(row[k], 0.0), rows - 1.000001)
+        c = min(max(col[k], 0.0), cols - 1.000001)
+        i, j = int(r), int(c)
+        u, v = r - i, c - j
+        above = raster[i, j] * (1.0 - v) + raster[i, j + 1] * v
+        below = raster[i + 1, j] * (1.0 - v) + raster[i + 1, j + 1] * v
+        out[k] = above * (1.0 - u) + below * u
     return out

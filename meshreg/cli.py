@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from meshreg import __version__
+from meshreg.cli_parts.options import for_both, join_settings, read_options
 from meshreg.errors import MeshregError, UsageError
 
 if TYPE_CHECKING:
@@ -342,6 +343,8 @@ def run(arguments: Sequence[str]) -> int:
         return 0
     except BaseException as error:
         return _failed(error, as_json, debug)
+    if code == 130:  # Ctrl-C before or after the job itself
+        return _failed(KeyboardInterrupt(), as_json, debug)
     return int(code or 0)
 
 
@@ -354,11 +357,11 @@ def _failed(error: BaseException, as_json: bool, debug: bool) -> int:
         code = getattr(error, "exit_code", getattr(error, "code", 1))
         return code if isinstance(code, int) else 1
     voice = _voice(as_json)
-    if debug and not isinstance(error, _ClickError):
-        voice.err.print("".join(traceback.format_exception(error)), markup=False)
     if isinstance(error, KeyboardInterrupt | StoppedError):
         voice.err.print("Stopped; nothing was written.")
         return error.exit_code if isinstance(error, StoppedError) else 130
+    if debug and not isinstance(error, _ClickError):
+        voice.err.print("".join(traceback.format_exception(error)), markup=False)
     if isinstance(error, MemoryError):
         error = out_of_memory(error)
     if isinstance(error, MeshregError):

@@ -63,6 +63,8 @@ import pyproj
 to_utm = pyproj.Transformer.from_crs(4326, 32754, always_xy=True, allow_ballpark=False)
 east, north = to_utm.transform(141.0, -38.0, errcheck=True)
 assert abs(east - 500000) < 1e-3, east
+import rasterio.crs
+assert rasterio.crs.CRS.from_epsg(32754).is_projected
 print("PROJ", pyproj.proj_version_str)
 """
 _PYE57 = "import pye57, importlib.metadata as m; print('pye57', m.version('pye57'))"
@@ -164,6 +166,18 @@ def _python() -> Check:
     return Check("Python", "ok" if new_enough else "missing", "everything", version)
 
 
+def _proj() -> Check:
+    """Probe PROJ as it is; where the environment misleads it, meshreg ignores that and says so."""
+    use = "coordinate systems"
+    found, said = run_probe(_PROJ)
+    misled = [name for name in ("PROJ_DATA", "PROJ_LIB") if name in os.environ]
+    if found or not misled:
+        return Check("PROJ", "ok" if found else "missing", use, said, "" if found else _PROJ_REMEDY)
+    clean = "import os\nfor n in ('PROJ_DATA', 'PROJ_LIB'): os.environ.pop(n, None)\n"
+    state: State = "optional" if run_probe(clean + _PROJ)[0] else "missing"
+    return Check("PROJ", state, use, f"{' and '.join(misled)} lead astray: {said}", _UNSET)
+
+
 def _writable(name: str, folder: Path, use: str) -> Check:
     try:
         with tempfile.TemporaryFile(dir=folder) as file:
@@ -178,6 +192,10 @@ def _writable(name: str, folder: Path, use: str) -> Check:
 
 def _reinstall(package: str) -> str:
     return f"{Path(sys.executable).name} -m pip install --force-reinstall {package}"
+
+
+_PROJ_REMEDY = _reinstall("pyproj rasterio")
+_UNSET = "unset PROJ_DATA PROJ_LIB"
 
 
 def examine() -> tuple[Check, ...]:
@@ -197,15 +215,7 @@ def examine() -> tuple[Check, ...]:
             needed=True,
             remedy=_reinstall("opencv-python-headless"),
         ),
-        lambda: _probe(
-            "PROJ",
-            "coordinate systems",
-            _PROJ,
-            needed=True,
-            remedy="unset PROJ_DATA PROJ_LIB"
-            if {"PROJ_DATA", "PROJ_LIB"} & set(os.environ)
-            else _reinstall("pyproj"),
-        ),
+        _proj,
         lambda: _probe(
             "GeoTIFF", "maps in and out", _GEOTIFF, needed=True, remedy=_reinstall("rasterio")
         ),

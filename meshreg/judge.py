@@ -163,6 +163,8 @@ def channel_map(
     if min(int(mask.sum()) for mask in valid) < 100:
         return None
     window = Window.around(reference.grid, moving.grid, radius)
+    if window.empty:
+        return None
     first, second = neutral.fields(reference, channel), neutral.fields(moving, channel)
     surface, counts = neutral.surface(first, second, window, min_overlap)
     exclusion = max(0.5, 5 * window.cell)

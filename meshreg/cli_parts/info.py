@@ -105,11 +105,12 @@ def _point_spacing(points: Float64) -> float | None:
     """Side of the square that each point has to itself, seen from above."""
     if len(points) < 2:
         return None
-    low, high = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
+    low, high = np.percentile(points[:, :2], [1, 99], axis=0)  # floaters lie far off
     side = float(np.sqrt(np.prod(np.maximum(high - low, 1e-9)) / len(points)))
     # Holes and ragged edges: count only the ground that has points, in fields of some 16 points.
     field = 4 * side
     index = np.floor((points[:, :2] - low) / field).astype(np.int64)
+    index -= index.min(axis=0)
     occupied = len(np.unique(index[:, 0] * (index[:, 1].max() + 1) + index[:, 1]))
     return float(np.sqrt(occupied * field**2 / len(points)))
 
@@ -187,7 +188,9 @@ def show(document: dict[str, Any], voice: Voice) -> None:
     if document["date"]:
         row("date", document["date"])
     for file in document["files"]:
-        counts = ", ".join(f"{number:,} {name}" for name, number in file["counts"].items())
+        counts = ", ".join(
+            f"{number:,} {name}" for name, number in file["counts"].items() if number
+        )
         row("file", f"{file['path']} ({file['format']}{': ' + counts if counts else ''})")
         if any(file["shift"]):
             origin = f" from {file['sidecar']}" if file["sidecar"] else ""
@@ -205,7 +208,10 @@ def show(document: dict[str, Any], voice: Voice) -> None:
     row("unit", document["unit"])
     up = document["up"]
     level = "level" if up["level"] else "NOT level"
-    row("up axis", f"thinnest along {up['guess']}, tilted by {up['tilt_degrees']:.1f}°: {level}")
+    row(
+        "up axis",
+        f"{up['guess']} (thinnest that way), tilted by {up['tilt_degrees']:.1f}°: {level}",
+    )
     for note in document["notes"]:
         row("note", note)
     voice.out.print(table)

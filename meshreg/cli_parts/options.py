@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +37,10 @@ def join_settings(
 
 def read_options(shift: str | None, name: str, **said: Any) -> ReadOptions:
     """Return what the user says of a survey; `name` is the option that gave the shift."""
-    return ReadOptions(shift=None if shift is None else _triple(shift, name), **said)
+    plain = {
+        key: str(value) if isinstance(value, StrEnum) else value for key, value in said.items()
+    }
+    return ReadOptions(shift=None if shift is None else _triple(shift, name), **plain)
 
 
 def _triple(text: str, name: str) -> tuple[float, float, float]:

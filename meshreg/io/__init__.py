@@ -25,8 +25,8 @@ READERS: dict[str, str] = {
     ".ply": "meshreg.io.ply:read",
     ".glb": "meshreg.io.gltf:read",
     ".gltf": "meshreg.io.gltf:read",
-    ".stl": "meshreg.io.gltf:read",
-    ".off": "meshreg.io.gltf:read",
+    ".stl": "meshreg.io.stl:read",
+    ".off": "meshreg.io.off:read",
     ".las": "meshreg.io.cloud:read",
     ".laz": "meshreg.io.cloud:read",
     ".e57": "meshreg.io.e57:read",
@@ -43,6 +43,8 @@ WRITERS: dict[str, str] = {
     ".obj": "meshreg.io.obj:write",
     ".ply": "meshreg.io.ply:write",
     ".glb": "meshreg.io.gltf:write",
+    ".stl": "meshreg.io.stl:write",
+    ".off": "meshreg.io.off:write",
     ".las": "meshreg.io.cloud:write",
     ".laz": "meshreg.io.cloud:write",
     ".e57": "meshreg.io.e57:write",
@@ -50,14 +52,15 @@ WRITERS: dict[str, str] = {
     ".csv": "meshreg.io.xyz:write",
     ".txt": "meshreg.io.xyz:write",
     ".tif": "meshreg.io.maps:write",
+    ".tiff": "meshreg.io.maps:write",
 }
 REWRITERS: dict[str, str] = {
     "obj": "meshreg.io.obj:rewrite",
     "ply": "meshreg.io.ply:rewrite",
     "glb": "meshreg.io.gltf:rewrite",
     "gltf": "meshreg.io.gltf:rewrite",
-    "stl": "meshreg.io.gltf:rewrite",
-    "off": "meshreg.io.gltf:rewrite",
+    "stl": "meshreg.io.stl:rewrite",
+    "off": "meshreg.io.off:rewrite",
     "las": "meshreg.io.cloud:rewrite",
     "e57": "meshreg.io.e57:rewrite",
     "xyz": "meshreg.io.xyz:rewrite",
@@ -114,7 +117,7 @@ def read_survey(
     UsageError
         An unknown option.
     """
-    from meshreg.io import blocks
+    from meshreg.io import blocks, merging
 
     options = options or ReadOptions()
     known = {item.name for item in dataclasses.fields(ReadOptions)}
@@ -123,7 +126,7 @@ def read_survey(
     options = dataclasses.replace(options, **overrides)
     found = blocks.find_blocks(path)
     surveys = [blocks.read_block(block, options) for block in found]
-    return surveys[0] if len(surveys) == 1 else blocks.merge(surveys, path)
+    return surveys[0] if len(surveys) == 1 else merging.merge(surveys, path)
 
 
 def write_survey(survey: Survey, path: str | Path) -> tuple[Path, ...]:

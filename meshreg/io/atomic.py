@@ -34,6 +34,12 @@ def _sync(path: Path) -> None:
         os.close(handle)
 
 
+def _sync_folder(path: Path) -> None:
+    """Make a rename last; the new file is in place already, so that failing here is no failure."""
+    with contextlib.suppress(OSError):
+        _sync(path)
+
+
 @contextlib.contextmanager
 def atomic_file(path: Path) -> Iterator[Path]:
     """Give a temporary path beside `path`; it becomes `path` when the block ends well.
@@ -54,7 +60,7 @@ def atomic_file(path: Path) -> Iterator[Path]:
             yield temporary
             _sync(temporary)
             os.replace(temporary, path)
-            _sync(path.parent)
+            _sync_folder(path.parent)
         finally:
             temporary.unlink(missing_ok=True)
 
@@ -86,7 +92,8 @@ def atomic_folder(
         Another run is writing there, or any OSError.
     """
     path = Path(os.path.abspath(path))
-    _require_replaceable(path, overwrite, markers)
+    with as_output_error(path):
+        _require_replaceable(path, overwrite, markers)
     prefix = f".{path.name[:100]}.{hashlib.sha256(os.fsencode(path.name)).hexdigest()[:8]}"
     with as_output_error(path), _locked(path, path.with_name(prefix + ".lock")):
         _clear_leftovers(path, prefix)
@@ -176,4 +183,4 @@ def _swap_in(temporary: Path, path: Path, old: Path) -> None:
         shutil.rmtree(old, ignore_errors=True)
     else:
         os.replace(temporary, path)
-    _sync(path.parent)
+    _sync_folder(path.parent)

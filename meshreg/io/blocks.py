@@ -1,4 +1,4 @@
-"""Find the files of a survey, know their format, merge blocks, rewrite them one by one."""
+"""Find the files of a survey, know their format, read and rewrite them one by one."""
 
 from __future__ import annotations
 
@@ -7,18 +7,16 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, cast
-
-import numpy as np
+from typing import cast
 
 from meshreg.errors import InputError, OutputError, UsageError
 from meshreg.io import READERS, REWRITERS, load
-from meshreg.io.frames import make_mover, reframe, registered_frame, to_file
+from meshreg.io.frames import make_mover, registered_frame, to_file
 from meshreg.io.mover import is_plain
 from meshreg.io.options import ReadOptions
 from meshreg.io.safe import fingerprint, open_regular, sha256
 from meshreg.io.sidecar import is_sidecar, write_shift
-from meshreg.types import Maps, Mesh, PointCloud, SourceFile, Survey, Transform
+from meshreg.types import SourceFile, Survey, Transform
 
 _MAGIC = (
     (b"ply", "PLY", (".ply",)),
@@ -203,6 +201,15 @@ def _one_format(files: Sequence[Path], where: Path) -> tuple[Block, ...]:
 
 def read_block(block: Block, options: ReadOptions) -> Survey:
     """Read one block; record its files' checksums and make sure that none changed meanwhile."""
+    for name in ("scale", "positions") if block.reader != READERS[""] else ():
+        if getattr(options, name) is not None:
+            raise UsageError(
+                f"{name} is for COLMAP models.",
+                file=block.path,
+                remedy="Give the unit, as a name or as its length in metres."
+                if name == "scale"
+                else None,
+            )
     is_file = block.path.is_file()
     before = fingerprint(block.path) if is_file else None
     survey = cast(Survey, load(block.reader)(block.path, options))
@@ -215,100 +222,6 @@ def _recorded(source: SourceFile) -> SourceFile:
     if not source.path.is_file() or (source.sha256 and source.fingerprint != (0, 0)):
         return source
     return replace(source, sha256=sha256(source.path), fingerprint=fingerprint(source.path))
-
-
-def merge(surveys: Sequence[Survey], path: Any) -> Survey:
-    """Join blocks into one survey, in one local origin and the first block's CRS.
-
-    Raises
-    ------
-    InputError
-        Blocks with and without CRS, of known and unknown scale, or of different kinds.
-    """
-    first = surveys[0]
-    names = [survey.source[0].path.name if survey.source else survey.name for survey in surveys]
-    for survey, name in zip(surveys, names, strict=True):
-        for what in ("crs", "scale_known"):
-            one, other = getattr(first, what), getattr(survey, what)
-            if (one is None or one is False) != (other is None or other is False):
-                raise InputError(
-                    f"{names[0]} and {name} cannot be blocks of one survey: {what} is "
-                    f"{one} and {other}.",
-                    file=str(path),
-                )
-        if type(survey.geometry) is not type(first.geometry) or isinstance(survey.geometry, Maps):
-            kinds = [type(item.geometry).__name__ for item in (first, survey)]
-            raise InputError(
-                f"{names[0]} ({kinds[0]}) and {name} ({kinds[1]}) cannot be merged.",
-                file=str(path),
-                remedy="Name blocks of one kind; maps are merged beforehand (gdalbuildvrt).",
-            )
-    if first.crs is not None:
-        surveys = [reframe(survey, first.crs) for survey in surveys]
-    ends = np.array([survey.bounds for survey in surveys])
-    origin = np.round((ends[:, 0].min(axis=0) + ends[:, 1].max(axis=0)) / 2)
-    notes: list[str] = []
-    geometry = _joined(surveys, origin, notes)
-    for survey, name in zip(surveys, names, strict=True):
-        notes += [f"{name}: {note}" for note in survey.notes]
-    dates = {survey.date for survey in surveys}
-    return Survey(
-        name=_common_name(surveys, path),
-        geometry=geometry,
-        origin=origin,
-        crs=first.crs,
-        date=dates.pop() if len(dates) == 1 else None,
-        scale_known=first.scale_known,
-        source=tuple(source for survey in surveys for source in survey.source),
-        notes=tuple(notes),
-    )
-
-
-def _common_name(surveys: Sequence[Survey], path: Any) -> str:
-    if isinstance(path, str | Path) and Path(path).is_dir():
-        return Path(path).resolve().name
-    same = 0
-    for letters in zip(*(survey.name for survey in surveys), strict=False):
-        if len(set(letters)) > 1:
-            break
-        same += 1
-    return surveys[0].name[:same].rstrip("_-. ") or surveys[0].name
-
-
-def _joined(surveys: Sequence[Survey], origin: Any, notes: list[str]) -> Mesh | PointCloud:
-    parts = [cast(Mesh | PointCloud, survey.geometry) for survey in surveys]
-    points = np.concatenate(
-        [part.points + (s.origin - origin) for part, s in zip(parts, surveys, strict=True)]
-    )
-    colors = [part.colors for part in parts if part.colors is not None]
-    if 0 < len(colors) < len(parts):
-        notes.append(f"Colours were left out: only {len(colors)} of {len(parts)} files have them.")
-    joined = np.concatenate(colors) if len(colors) == len(parts) else None
-    if isinstance(parts[0], PointCloud):
-        return PointCloud(points, joined)
-    return _joined_mesh(cast(list[Mesh], parts), points, joined)
-
-
-def _joined_mesh(parts: Sequence[Mesh], points: Any, colors: Any) -> Mesh:
-    starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
-    if starts[-1] > np.iinfo(np.int32).max:
-        raise InputError(f"the blocks have {starts[-1]} vertices together; 2^31 are too many.")
-    faces = np.concatenate(
-        [part.faces + np.int32(start) for part, start in zip(parts, starts, strict=False)]
-    )
-    textures = tuple(texture for part in parts for texture in part.textures)
-    if all(part.uv is None for part in parts):
-        return Mesh(points, faces, colors)
-    uv, pages, count = [], [], 0
-    for part in parts:
-        if part.uv is None or part.face_texture is None:
-            uv.append(np.zeros((len(part.faces), 3, 2), np.float32))
-            pages.append(np.full(len(part.faces), -1, np.int32))
-        else:
-            uv.append(part.uv)
-            pages.append(np.where(part.face_texture >= 0, part.face_texture + np.int32(count), -1))
-        count += len(part.textures)
-    return Mesh(points, faces, colors, np.concatenate(uv), np.concatenate(pages), textures)
 
 
 def rewrite(

@@ -112,7 +112,8 @@ def read(path: Path, options: ReadOptions) -> Survey:
 
 
 def _require_consistent(options: ReadOptions) -> None:
-    given = [name for name in ("scale", "unit", "shift") if getattr(options, name) is not None]
+    names = ("scale", "unit", "shift", "axes", "up")
+    given = [name for name in names if getattr(options, name) is not None]
     if options.positions is not None and given:
         raise UsageError(f"positions and {given[0]} were both given.", remedy="Give one of them.")
     if options.scale is not None and options.unit is not None:
@@ -147,22 +148,34 @@ def _place(
     """Return the points in place, and whether their scale is known."""
     points = model.points[kept]
     said = sidecar or SidecarInfo()
-    stated = (options.axes, options.up, said.axes, said.up)
-    level = np.eye(3) if any(item is not None for item in stated) else _level(model, kept, notes)
-    positions = _positions(path, model, options, sidecar)
+    stated = _stated(options, said)
+    if stated:
+        level = np.eye(3)
+        notes.append(f"Taken to be level already, as {' and '.join(stated)} is stated.")
+    else:
+        level = _level(model, kept, notes)
+    positions = _positions(path, model, options, stated)
     if positions is not None:
         frame = _frame_by_positions(model, positions, level, options, notes)
         origin = np.round(points.mean(axis=0) @ frame.axes.T + frame.shift)
         moved = points @ frame.axes.T + (frame.shift - origin)
         return Placed(moved, origin, frame, (), said.path, said.name, said.date), True
-    # A model that a sidecar places, or whose unit somebody states, is no longer arbitrary.
-    known = options.unit is not None or said.unit is not None or said.shift is not None
+    known = bool({"unit", "shift"} & set(stated))
     scale = options.scale or 1.0
     if options.scale is not None:
         notes.append(f"One unit of the model was stated to be {scale:g} m.")
     elif not known:
         notes.append("The model's unit, place and heading are arbitrary (no camera positions).")
     return place(path, points, options, None, scale * level, georeferenced=True), known
+
+
+def _stated(options: ReadOptions, said: SidecarInfo) -> list[str]:
+    """Return what options or a sidecar state that an arbitrary frame could not have."""
+    return [
+        name
+        for name in ("shift", "axes", "up", "unit")
+        if getattr(options, name) is not None or getattr(said, name) is not None
+    ]
 
 
 def _level(model: Model, kept: Any, notes: list[str]) -> Float64:
@@ -185,13 +198,12 @@ def _level(model: Model, kept: Any, notes: list[str]) -> Float64:
 
 
 def _positions(
-    path: Path, model: Model, options: ReadOptions, sidecar: SidecarInfo | None
+    path: Path, model: Model, options: ReadOptions, stated: list[str]
 ) -> Positions | None:
     """Return the stated positions, else those of the photographs; None where nothing says."""
     if options.positions is not None:
         return read_positions(options.positions)
-    stated = (options.scale, options.unit, options.shift, options.axes, options.up)
-    if sidecar is not None or any(item is not None for item in stated):
+    if stated or options.scale is not None:
         return None
     found = exif_positions(path, model.names)
     return found if len(found.names) >= 3 else None

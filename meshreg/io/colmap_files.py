@@ -185,10 +185,17 @@ def _plain(model: Any, posed: list[Any]) -> Model:
         colors=np.array([point.color for point in points], np.uint8).reshape(-1, 3),
         errors=np.array([point.error for point in points], float),
         tracks=np.array([point.track.length() for point in points]),
-        names=tuple(image.name for image in posed),
+        names=tuple(map(_image_name, posed)),
         centres=-np.einsum("nji,nj->ni", turns, shifts),  # C = -R' t
         views=turns[:, 2],  # the camera's z axis, seen from the world
     )
+
+
+def _image_name(image: Any) -> str:
+    try:
+        return str(image.name)
+    except UnicodeDecodeError:  # pycolmap takes every name for UTF-8
+        return f"image {image.image_id}"
 
 
 def camera_from_world(image: Any) -> Any:

@@ -100,9 +100,10 @@ def pieces(
     with _in_plain_words(libe57, path):
         for data in _raw(libe57, file, number, [*names, *extra], min(CHUNK, scan.count)):
             local = np.stack([data[name] for name in coordinates], axis=1)
-            if spherical:
-                local = cartesian(local)
-            xyz = local @ rotation.T + scan.translation
+            with np.errstate(all="ignore"):  # what is not finite is left out below
+                if spherical:
+                    local = cartesian(local)
+                xyz = local @ rotation.T + scan.translation
             valid = np.asarray(np.isfinite(xyz).all(axis=1))
             if state in data:
                 valid = valid & (data[state] == 0)

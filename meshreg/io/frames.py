@@ -16,14 +16,8 @@ import numpy as np
 
 from meshreg.errors import InputError, MeshregError, UsageError
 from meshreg.io.bridge import bridge
-from meshreg.io.crs import (
-    check_area,
-    crs_name,
-    crs_text,
-    grid_scale_and_convergence,
-    metres_per_unit,
-    metric_crs,
-)
+from meshreg.io.crs import crs_name, crs_text, grid_scale_and_convergence, metric_crs
+from meshreg.io.framing import ENU, NED, UNITS, Y_UP, frame_from
 from meshreg.io.mover import Mover, frame_matrix, make_mover, to_absolute, to_file
 from meshreg.io.options import ReadOptions
 from meshreg.io.sidecar import SidecarInfo, find_sidecar
@@ -31,118 +25,7 @@ from meshreg.types import Float64, Frame, Maps, Mesh, PointCloud, SourceFile, Su
 
 _LOG = logging.getLogger("meshreg")
 
-ENU = np.eye(3)
-NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
-Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-UNITS = {
-    "m": 1.0,
-    "dm": 0.1,
-    "cm": 0.01,
-    "mm": 0.001,
-    "km": 1000.0,
-    "ft": 0.3048,
-    "us-ft": 1200 / 3937,
-    "in": 0.0254,
-}
 _COLLAPSED = 0.02  # share of points fallen together from which 32-bit steps have spoilt a survey
-
-
-def frame_from(
-    options: ReadOptions,
-    sidecar: SidecarInfo | None = None,
-    file_crs: str | None = None,
-    default_axes: Any = None,
-    *,
-    centre: Any = None,
-) -> Frame:
-    """Join what the user, the sidecar and the file say into one `Frame`.
-
-    Parameters
-    ----------
-    options : ReadOptions
-        What the user says; it replaces what the sidecar says, item by item.
-    sidecar : SidecarInfo or None
-    file_crs : str or None
-        CRS found in the file itself, any spelling.
-    default_axes : (3, 3) array or None
-        Axes of the format where nobody says otherwise; `Y_UP` for glTF, else x east, y north, up.
-    centre : (3,) array or None
-        Centre of the file's coordinates, as stored. Needed wherever a CRS is known, to check its
-        area and to choose a UTM zone for degrees and feet; without it the CRS must be metric.
-
-    Returns
-    -------
-    Frame
-        `shift` is in metres, or in the CRS's own unit where that is feet or degrees.
-
-    Raises
-    ------
-    UsageError
-        Unknown axes or unit, or both `axes` and `up`.
-    InputError
-        Unknown CRS, two that disagree, or coordinates outside its area.
-    """
-    said = sidecar or SidecarInfo()
-    crs = _file_crs(options, said, file_crs)
-    axes = _axes(options, said, default_axes)
-    unit = options.unit if options.unit is not None else said.unit
-    if unit is not None:
-        axes = axes * (_unit(unit) / (metres_per_unit(crs) if crs else 1.0))
-    shift = np.array(options.shift if options.shift is not None else said.shift or (0, 0, 0), float)
-    if shift.shape != (3,) or not np.isfinite(shift).all():
-        raise UsageError(f"shift is {shift.tolist()}; it needs three finite numbers.")
-    if crs is None:
-        return Frame(axes, shift)
-    if centre is None:
-        raise UsageError("The centre of the coordinates is needed to place them in their CRS.")
-    place = axes @ np.asarray(centre, float) + shift
-    check_area(crs, *place)
-    return Frame(axes, shift, crs, metric_crs(crs, place))
-
-
-def _file_crs(options: ReadOptions, said: SidecarInfo, file_crs: str | None) -> str | None:
-    """Decide on the CRS: the user's, else our own sidecar's, else the file's or another sidecar's.
-
-    A .prj, coords.txt or SHIFT.txt that contradicts the file is refused: one of them is stale.
-    """
-    own = crs_text(file_crs) if file_crs else None
-    beside = crs_text(said.crs) if said.crs else None
-    if options.crs:
-        return crs_text(options.crs)
-    if own and beside and own != beside and not said.explicit_crs:
-        raise InputError(
-            f"the file says {crs_name(own)}, but {said.crs_path} says {crs_name(beside)}.",
-            remedy="Remove the wrong one, or say which by a .survey.toml.",
-        )
-    return beside or own
-
-
-def _axes(options: ReadOptions, said: SidecarInfo, default: Any) -> Float64:
-    axes: Any = said.axes
-    up: Any = said.up
-    if options.axes is not None or options.up is not None:
-        axes, up = options.axes, options.up
-    if axes is not None and not isinstance(axes, str):
-        return np.array(axes, float)
-    if axes == "ned" and up == "y":
-        raise UsageError('axes="ned" and up="y" contradict each other.', remedy="Give one.")
-    if axes not in (None, "enu", "ned") or up not in (None, "y", "z"):
-        raise UsageError(f'axes is {axes!r} and up {up!r}; use "enu" or "ned", "y" or "z".')
-    if axes == "ned":
-        return NED.copy()
-    if up == "y":
-        return Y_UP.copy()
-    if axes is None and up is None and default is not None:
-        return np.array(default, float)
-    return ENU.copy()
-
-
-def _unit(unit: str | float) -> float:
-    """Return the length of a unit [m]; a number is taken as metres itself."""
-    length = UNITS.get(unit.strip().lower()) if isinstance(unit, str) else float(unit)
-    if length is None or not (np.isfinite(length) and length > 0):
-        raise UsageError(f"unit {unit!r} is not known.", remedy=f"Use one of {', '.join(UNITS)}.")
-    return length
 
 
 @dataclass(frozen=True, eq=False)
@@ -362,7 +245,7 @@ def registered_frame(reference: SourceFile, moving: SourceFile, *, centre: Any =
     if own_axes:
         unit = float(np.cbrt(abs(np.linalg.det(moving.frame.axes))))
         shift = frame.shift if frame.is_linear else np.zeros(3)
-        frame = Frame(moving.frame.axes / unit, shift, frame.crs, frame.crs)
+        frame = Frame(np.round(moving.frame.axes / unit, 12), shift, frame.crs, frame.crs)
     if centre is None or not (own_axes or moving.format == "stl"):
         return frame
     local = to_file(frame, np.atleast_2d(centre))

@@ -73,10 +73,10 @@ def read_height(path: Path, max_pixels: int) -> RawMap:
         scale, offset = dataset.scales[0], dataset.offsets[0]
         values = np.empty(dataset.shape, np.float32)
         for window in windows(dataset):
-            part = dataset.read(1, window=window).astype(np.float64)
-            part[dataset.read_masks(1, window=window) < 128] = np.nan
             rows = slice(window.row_off, window.row_off + window.height)
-            with np.errstate(over="ignore"):
+            with np.errstate(all="ignore"):  # what is not finite becomes NaN below
+                part = dataset.read(1, window=window).astype(np.float64)
+                part[dataset.read_masks(1, window=window) < 128] = np.nan
                 values[rows] = part * scale + offset if (scale, offset) != (1, 0) else part
         declared = dataset.nodata
         unit = (dataset.units[0] or "").strip()

@@ -25,12 +25,15 @@ from meshreg.types import Float64, UInt8
 
 _JSON, _BIN = 0x4E4F534A, 0x004E4942
 _DAMAGED = "The file is cut off or damaged; export or copy it again."
-_DEPTH = 64  # of the node tree
-_MAX_NODES = 1_000_000
 COMPONENTS = {5120: "i1", 5121: "u1", 5122: "i2", 5123: "u2", 5125: "u4", 5126: "f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 # Required extensions that change nothing that is read here, or are read.
-_UNDERSTOOD = ("KHR_materials_", "KHR_texture_transform", "KHR_mesh_quantization", "EXT_texture_webp")
+_UNDERSTOOD = (
+    "KHR_materials_",
+    "KHR_texture_transform",
+    "KHR_mesh_quantization",
+    "EXT_texture_webp",
+)
 _COMPRESSED = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression")
 
 
@@ -172,7 +175,8 @@ class Document:
         if "sparse" in item or "bufferView" not in item:
             what = "is sparse" if "sparse" in item else "has no bufferView (all zero)"
             self.fail(f"{what}, which is not read.", place, "Export it without that.")
-        kind = COMPONENTS.get(item.get("componentType", 0))
+        code = item.get("componentType")
+        kind = COMPONENTS.get(code) if type(code) is int else None
         width = _WIDTHS.get(str(item.get("type")))
         if kind is None or width is None or width not in widths:
             self.fail(
@@ -206,6 +210,12 @@ class Document:
         return np.maximum(values / np.float64(np.iinfo(values.dtype).max), -1.0)
 
 
+def extension(owner: dict[str, Any], name: str) -> Any:
+    """Return an object's extension of that name, or None."""
+    extensions = owner.get("extensions")
+    return extensions.get(name) if isinstance(extensions, dict) else None
+
+
 def read_document(path: Path) -> Document:
     """Read a .glb or .gltf, told by its first bytes, and check its asset and extensions.
 
@@ -237,7 +247,7 @@ def _read_glb(path: Path, data: UInt8) -> Document:
 
     if len(data) < 20:
         fail(f"ends after {len(data)} bytes.", len(data))
-    version, length = struct.unpack("<II", data[4:12])
+    version, length = struct.unpack("<II", bytes(data[4:12]))
     if version != 2:
         fail(f"is GLB version {version}; 2 is read.", 4)
     if length != len(data):
@@ -247,7 +257,7 @@ def _read_glb(path: Path, data: UInt8) -> Document:
     while here < len(data):
         if here + 8 > len(data):
             fail("ends within the head of a chunk.", here)
-        size, kind = struct.unpack("<II", data[here : here + 8])
+        size, kind = struct.unpack("<II", bytes(data[here : here + 8]))
         if here + 8 + size > len(data) or size % 4:
             fail(f"has a chunk of {size} bytes, but {len(data) - here - 8} are there.", here)
         chunks.append((kind, here + 8, here + 8 + size))
@@ -302,94 +312,3 @@ def _check_extensions(document: Document) -> None:
                 "extensionsRequired",
                 "Export it without that.",
             )
-
-
-def mesh_instances(document: Document) -> list[tuple[int, Float64]]:
-    """Walk the scene and return each mesh with the matrix of its place.
-
-    Returns
-    -------
-    list of (mesh index, (4, 4) float64)
-        Matrices from the mesh's to the file's coordinates, in the order of the scene.
-
-    Raises
-    ------
-    InputError
-        A node that is reached twice (a cycle, or two parents), more than 64 levels, a matrix
-        that is none, a skinned mesh.
-    """
-    nodes = document.items("nodes")
-    found = []
-    seen: set[int] = set()
-    stack = [(index, np.eye(4), 1) for index in reversed(scene_roots(document))]
-    while stack:
-        index, above, depth = stack.pop()
-        place = f"nodes[{index}]"
-        node = document.item("nodes", index, place)
-        if index in seen:
-            document.fail("is reached twice: the nodes are no tree.", place)
-        seen.add(index)
-        if depth > _DEPTH or len(seen) > _MAX_NODES:
-            document.fail(f"lies more than {_DEPTH} levels deep.", place)
-        if "skin" in node or node.get("weights"):
-            document.fail("is skinned or morphed, which is not read.", place, "Export it rigid.")
-        matrix = above @ _node_matrix(document, node, place)
-        if "mesh" in node:
-            document.item("meshes", node["mesh"], place)
-            found.append((int(node["mesh"]), matrix))
-        children = node.get("children", [])
-        if not isinstance(children, list) or len(children) > len(nodes):
-            document.fail("has children that are no list of nodes.", place)
-        stack += [(child, matrix, depth + 1) for child in reversed(children)]
-    return found
-
-
-def scene_roots(document: Document) -> list[int]:
-    """Return the root nodes of the default scene; without scenes, the nodes that are no child."""
-    if document.items("scenes"):
-        scene = document.item("scenes", document.tree.get("scene", 0), "scene")
-        roots = scene.get("nodes", [])
-    else:
-        nodes = document.items("nodes")
-        lists = [node.get("children", []) for node in nodes]
-        children = {c for below in lists if isinstance(below, list) for c in below if type(c) is int}
-        roots = [index for index in range(len(nodes)) if index not in children]
-    if not isinstance(roots, list) or not all(type(root) is int for root in roots):
-        document.fail("has a scene whose nodes are no list of numbers.", "scenes")
-    return roots
-
-
-def _node_matrix(document: Document, node: dict[str, Any], place: str) -> Float64:
-    """Return a node's own matrix: 16 numbers by columns, or translation * rotation * scale."""
-    flat = document.numbers(node, "matrix", 16, place)
-    if flat is not None:
-        matrix = flat.reshape(4, 4).T
-        if not np.allclose(matrix[3], (0, 0, 0, 1)):
-            document.fail("has a matrix that is not affine.", place)
-        return matrix
-    matrix = np.eye(4)
-    turn = document.numbers(node, "rotation", 4, place)
-    if turn is not None:
-        length = float(np.sqrt(turn @ turn))
-        if not 0.5 < length < 2:
-            document.fail(f"has a rotation of length {length:.3g}, not 1.", place)
-        matrix[:3, :3] = _rotation(turn / length)
-    scale = document.numbers(node, "scale", 3, place)
-    if scale is not None:
-        matrix[:3, :3] *= scale
-    move = document.numbers(node, "translation", 3, place)
-    if move is not None:
-        matrix[:3, 3] = move
-    return matrix
-
-
-def _rotation(quaternion: Float64) -> Float64:
-    """Rotation matrix of a unit quaternion x, y, z, w."""
-    x, y, z, w = quaternion
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )

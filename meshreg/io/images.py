@@ -213,7 +213,10 @@ class _RasterioImage:
         self.mode = f"{bands} of {self._file.dtypes[0]}"
 
     def pixels(self) -> UInt8:
+        """Decode the first three bands, and the fourth where it is called alpha."""
         bands = [1, 2, 3] if self._file.count >= 3 else [1, 1, 1]
+        if self._file.count > 3 and self._file.colorinterp[3].name == "alpha":
+            bands.append(4)
         return _to_eight_bits(np.moveaxis(self._file.read(bands), 0, -1))
 
     def __enter__(self) -> _RasterioImage:
@@ -245,7 +248,8 @@ def _to_eight_bits(values: Any) -> UInt8:
         scale = 255.0 if values.size and values.max() <= 1.0 else 1.0
     else:
         scale = 255.0 / np.iinfo(values.dtype).max
-    return np.clip(np.rint(values * scale), 0, 255).astype(np.uint8)
+    scaled: UInt8 = np.clip(np.rint(values * scale), 0, 255).astype(np.uint8)
+    return scaled
 
 
 def _pixels(image: Any, name: str) -> UInt8:

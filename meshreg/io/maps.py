@@ -205,17 +205,18 @@ def _placed(raw: RawMap, forward: Forward) -> Placed:
 
 def _on_map(raw: RawMap, frame: Frame, notes: list[str]) -> tuple[Float32 | UInt8, Bool, Grid]:
     """Return a raster's values on a north-up square grid in metres, sampled anew if need be."""
-    (a, b, west), (d, e, north) = raw.matrix
+    (a, b, west), (d, e, north) = raw.matrix.tolist()
     rows, cols = raw.valid.shape
+    shift = frame.shift.tolist()
     square = abs(a - abs(e)) * max(rows, cols) < 0.01 * abs(a)
     if frame.is_linear and np.array_equal(frame.axes[:2, :2], np.eye(2)) and not (b or d) and a > 0:
         if square:
             values, valid = raw.values, raw.valid
             if e > 0:  # row 0 in the south
                 values, valid, north = values[::-1], valid[::-1], north + rows * e
-            grid = Grid(west + frame.shift[0], north + frame.shift[1], a, (rows, cols), frame.crs)
-            if _is_height(raw) and (frame.axes[2, 2], frame.shift[2]) != (1, 0):
-                values = (values * frame.axes[2, 2] + frame.shift[2]).astype(np.float32)
+            grid = Grid(west + shift[0], north + shift[1], a, (rows, cols), frame.crs)
+            if _is_height(raw) and (frame.axes[2, 2], shift[2]) != (1, 0):
+                values = (values * frame.axes[2, 2] + shift[2]).astype(np.float32)
             return values, valid, grid
         why = f"its pixels are {a:.9g} by {abs(e):.9g}"
     elif b or d:

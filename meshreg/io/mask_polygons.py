@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import logging
 import struct
+import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -26,6 +27,17 @@ log = logging.getLogger("meshreg")
 
 MAX_BYTES = 200_000_000
 KINDS = "Give a GeoTIFF, a GeoJSON file of polygons, or a shapefile."
+_BROKEN = (
+    ArithmeticError,
+    AttributeError,
+    EOFError,
+    LookupError,
+    MemoryError,
+    TypeError,
+    ValueError,
+    Warning,
+    struct.error,
+)
 _LON_LAT = "OGC:CRS84"
 _POLYGON_SHAPES = (5, 15, 25)  # Polygon, PolygonZ, PolygonM
 
@@ -137,25 +149,20 @@ def read_shapefile(path: Path) -> tuple[tuple[Area, ...], str | None]:
         streams["dbf"] = open_regular(table)
     areas = []
     try:
-        with shapefile.Reader(**streams, encodingErrors="replace") as reader:
-            for number, shape in enumerate(reader.iterShapes()):
-                if shape.shapeType not in _POLYGON_SHAPES:
-                    continue
-                record = {} if table is None else reader.record(number).as_dict()
-                ends = [*shape.parts, len(shape.points)]
-                rings = (shape.points[a:b] for a, b in pairwise(ends))
-                areas.append(Area(tuple(map(_ring, rings)), _use(record)))
-    except (
-        shapefile.ShapefileException,
-        struct.error,
-        ValueError,
-        IndexError,
-        TypeError,
-        OverflowError,
-        MemoryError,
-        EOFError,
-    ) as error:
-        raise InputError(f"is a damaged shapefile: {error}.", file=path, remedy=KINDS) from error
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")  # a file that makes the reader doubt is refused
+            with shapefile.Reader(**streams, encodingErrors="replace") as reader:
+                for number, shape in enumerate(reader.iterShapes()):
+                    if shape.shapeType not in _POLYGON_SHAPES:
+                        continue
+                    record = {} if table is None else reader.record(number).as_dict()
+                    ends = [*shape.parts, len(shape.points)]
+                    rings = (shape.points[a:b] for a, b in pairwise(ends))
+                    areas.append(Area(tuple(map(_ring, rings)), _use(record)))
+    except (*_BROKEN, shapefile.ShapefileException) as error:
+        raise InputError(
+            f"is a damaged shapefile: {type(error).__name__} {error}.", file=path, remedy=KINDS
+        ) from error
     finally:
         for stream in streams.values():
             stream.close()

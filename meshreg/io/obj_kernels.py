@@ -33,6 +33,7 @@ from meshreg.io.obj_text_kernels import (
     WEIGHTED,
     WITH_UV,
     is_blank,
+    is_break,
     is_end,
     read_index,
     read_number,
@@ -127,15 +128,17 @@ def _corner(
     uv[at] = -1
     if error == OK and data[here] == _SLASH:
         here += 1
-        if not (data[here] == _SLASH or is_blank(data[here]) or is_end(data[here])):
+        if not (data[here] == _SLASH or is_blank(data[here]) or is_break(data[here])):
             uv[at], here, error = read_index(data, here, state[UVS], state)
             parts = 1
         if error == OK and data[here] == _SLASH:
             here += 1
-            if not (is_blank(data[here]) or is_end(data[here])):
+            if not (is_blank(data[here]) or is_break(data[here])):
                 _, here, error = read_index(data, here, 0, state)
                 parts += 2
-    if error == OK and not (is_blank(data[here]) or is_end(data[here]) or data[here] == _BACKSLASH):
+    if error == OK and not (
+        is_blank(data[here]) or is_break(data[here]) or data[here] == _BACKSLASH
+    ):
         error = BAD_INDEX
     return here, parts, error
 
@@ -173,14 +176,14 @@ def _starts_with(data: Any, here: int, word: Any) -> bool:
         if data[here + k] != word[k]:
             return False
     after = data[here + len(word)]
-    return is_blank(after) or is_end(after)
+    return is_blank(after) or is_break(after)
 
 
 @jit(nogil=True)
 def _other_statement(data: Any, here: int, state: Any, events: Any) -> int:
     """Take note of any statement but v, vt, vn and f; return the place behind its line."""
     byte = data[here]
-    single = is_blank(data[here + 1]) or is_end(data[here + 1])
+    single = is_blank(data[here + 1]) or is_break(data[here + 1])
     kind = 0
     named = False
     if byte == 117 and _starts_with(data, here, _USEMTL):
@@ -216,15 +219,16 @@ def _statement(
     """Read one statement; return a place on its line (or behind it), error, if it is behind."""
     vertex, uv, sizes = faces
     byte, after = data[here], data[here + 1]
-    spaced = is_blank(after) or after == _BACKSLASH or is_end(after)
+    spaced = is_blank(after) or after == _BACKSLASH or is_break(after)
     if byte == 118:
         if spaced:
             place, error = _vertex(data, here + 1, state, points, colors, events)
             return place, error, False
-        if after == 116 and is_blank(data[here + 2]):
+        named = is_blank(data[here + 2]) or is_break(data[here + 2])
+        if after == 116 and named:
             place, error = _texture_vertex(data, here + 2, state, uvs, events)
             return place, error, False
-        if after == 110 and is_blank(data[here + 2]):
+        if after == 110 and named:
             state[NORMALS] += 1
             return here, OK, False
     elif byte == 102 and spaced:
@@ -278,6 +282,8 @@ def parse(
             here = place if behind else skip_line(data, place, joins, state)
             if here - start > MAX_LINE + 2 and state[LINES] == lines + 1:
                 place, error = start, LONG_LINE
+        elif skip_line(data, start, False, state) - start > MAX_LINE + 2:
+            place, error = start, LONG_LINE  # what else is wrong may come of cutting it
         if error != OK:
             state[ERROR], state[ERROR_AT], state[LINES] = error, place, lines
             return end

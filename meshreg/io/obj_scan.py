@@ -7,22 +7,18 @@ from __future__ import annotations
 
 import hashlib
 import os
-import re
-from collections import deque
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from meshreg.errors import InputError, ResourceLimitError
 from meshreg.io.line_blocks import BLOCK, Block, in_order, line_blocks
-from meshreg.io.safe import decode_name, open_regular
+from meshreg.io.obj_lines import Lines, Worker, word_at
+from meshreg.io.safe import open_regular
 from meshreg.types import Float32, Float64, Int32
 
-_NUMBER = re.compile(rb"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
-_NONFINITE = re.compile(rb"[+-]?(nan|inf|1\.#)", re.IGNORECASE)  # as C libraries print them
 _COUNTED = (
     *("VERTICES", "UVS", "NORMALS", "FACES", "OBJECTS", "GROUPS"),
     *("ELEMENTS", "OTHERS", "WEIGHTED", "COLORED"),
@@ -88,7 +84,7 @@ def scan(path: Path) -> Scan:
     joiner = _Joiner(path)
     with open_regular(path) as stream:
         before = os.fstat(stream.fileno())
-        found = in_order(line_blocks(stream, path, hasher), _Worker(), before.st_size)
+        found = in_order(line_blocks(stream, path, hasher), Worker(), before.st_size)
         for block, lines in found:
             joiner.add(block, lines)
         after = os.fstat(stream.fileno())
@@ -102,7 +98,7 @@ def line_of_face(path: Path, face: int) -> int:
     """Return the number of the line (from 1) that holds a face (from 0)."""
     from meshreg.io import obj_text_kernels as text
 
-    work = _Worker()
+    work = Worker()
     n_lines = 0
     with open_regular(path) as stream:
         for block in line_blocks(stream, path):
@@ -114,110 +110,6 @@ def line_of_face(path: Path, face: int) -> int:
     return n_lines + 1
 
 
-@dataclass(frozen=True, eq=False)
-class _Lines:
-    """What is in one block: its arrays, `names` (kind, faces before, name), `wrong` words."""
-
-    state: NDArray[np.int64]
-    points: Float64
-    colors: Float32
-    uvs: Float32
-    vertex: Int32
-    uv: Int32 | None
-    sizes: Int32 | None
-    names: list[tuple[int, int, str]] = field(default_factory=list)
-    wrong: list[tuple[int, str]] = field(default_factory=list)
-
-
-class _Worker:
-    """Runs the kernel over blocks, each independent of all others; keeps its scratch arrays."""
-
-    def __init__(self) -> None:
-        self._scratch: deque[Any] = deque()
-
-    def __call__(self, block: Block, stop: int = -1) -> _Lines:
-        from meshreg.io import obj_text_kernels as text
-        from meshreg.io.obj_fast_kernels import parse_plain
-        from meshreg.io.obj_kernels import parse
-
-        try:
-            scratch = self._scratch.pop()
-        except IndexError:
-            scratch = _new_scratch(2 * BLOCK)
-        floats, faces, events = scratch
-        state = np.zeros(text.N_STATE, np.int64)
-        here = 0
-        while here < block.end:
-            here = parse_plain(block.data, here, block.end, stop, state, floats, faces)
-            if here < block.end:
-                here = parse(block.data, here, block.end, stop, state, floats, faces, events)
-        (points, colors, uvs), (vertex, uv, sizes) = floats, faces
-        n_points, n_uvs, n_corners = state[[text.VERTICES, text.UVS, text.CORNERS]]
-        lines = _Lines(
-            state,
-            points[:n_points].copy(),
-            colors[: n_points if state[text.COLORED] else 0].copy(),
-            uvs[:n_uvs].copy(),
-            vertex[:n_corners].copy(),
-            uv[:n_corners].copy() if state[text.WITH_UV] else None,
-            sizes[: state[text.FACES]].copy() if state[text.POLYGONS] else None,
-        )
-        for event in events[: state[text.EVENTS]].tolist():
-            _note(block, lines, event)
-            if lines.wrong:
-                break
-        self._scratch.append(scratch)
-        return lines
-
-
-def _new_scratch(size: int) -> Any:
-    """Return arrays that what is in a block of `size` bytes fits; untouched pages cost nothing."""
-    return (
-        (
-            np.empty((size // 6 + 2, 3)),
-            np.empty((size // 6 + 2, 3), np.float32),
-            np.empty((size // 4 + 2, 2), np.float32),
-        ),
-        (
-            np.empty(size // 2 + 2, np.int32),
-            np.empty(size // 2 + 2, np.int32),
-            np.empty(size // 6 + 2, np.int32),
-        ),
-        np.empty((size // 2 + 2, 5), np.int64),
-    )
-
-
-def _note(block: Block, lines: _Lines, event: list[int]) -> None:
-    """Keep a name, or read a word that the kernel could not: NaN, infinity, very long numbers."""
-    from meshreg.io import obj_kernels as kernels
-
-    kind, target, start, end, line = event
-    word = block.data[start:end].tobytes()
-    if kind in (kernels.USEMTL, kernels.MTLLIB):
-        lines.names.append((kind, target, decode_name(word)))
-        return
-    if _NUMBER.fullmatch(word):
-        value = float(word)
-    elif _NONFINITE.match(word):
-        value = float("nan")
-    else:
-        lines.wrong.append((line, _word_at(block, start)))
-        return
-    arrays: dict[int, Any] = {
-        kernels.POINT_WORD: lines.points,
-        kernels.COLOR_WORD: lines.colors,
-        kernels.UV_WORD: lines.uvs,
-    }
-    # The numbers of a line that turns out to be wrong lie behind the arrays' ends.
-    if kind in arrays and target < arrays[kind].size:
-        arrays[kind].reshape(-1)[target] = value
-
-
-def _word_at(block: Block, start: int) -> str:
-    words = block.data[start : start + 40].tobytes().split(maxsplit=1)
-    return decode_name(words[0]) if words else ""
-
-
 class _Joiner:
     """Joins what is in the blocks, in the order of the file; says what is wrong, and where."""
 
@@ -225,12 +117,12 @@ class _Joiner:
         from meshreg.io import obj_text_kernels as text
 
         self._path = path
-        self._parts: list[_Lines] = []
+        self._parts: list[Lines] = []
         self._totals = np.zeros(text.N_STATE, np.int64)
         self._names: list[tuple[int, int, str]] = []
         self._ends_whole = True
 
-    def add(self, block: Block, lines: _Lines) -> None:
+    def add(self, block: Block, lines: Lines) -> None:
         """Take the next block; raise for what is wrong in it."""
         from meshreg.io import obj_text_kernels as text
 
@@ -268,7 +160,7 @@ class _Joiner:
         if code == text.LONG_LINE:
             message = f"the line is longer than {BLOCK} bytes."
             return ResourceLimitError(message, file=self._path, place=place)
-        word = _word_at(block, int(state[text.ERROR_AT]))
+        word = word_at(block, int(state[text.ERROR_AT]))
         if code not in (text.FEW_NUMBERS, text.MANY_NUMBERS):
             place += f" (face {self._totals[text.FACES] + state[text.FACES] + 1})"
         message = {

@@ -38,8 +38,14 @@ def is_blank(byte: Any) -> bool:
 
 
 @jit(nogil=True)
+def is_break(byte: Any) -> bool:
+    """Whether a byte ends a line."""
+    return bool(byte == 10 or byte == 13)  # noqa: PLR1714
+
+
+@jit(nogil=True)
 def is_end(byte: Any) -> bool:
-    """Whether the statement is over: a line end or a comment."""
+    """Whether the statement is over where a word could start: a line end or a comment."""
     return bool(byte == 10 or byte == 13 or byte == _HASH)  # noqa: PLR1714
 
 
@@ -78,7 +84,7 @@ def skip_line(data: Any, here: int, joins: bool, state: Any) -> int:
 @jit(nogil=True)
 def word_end(data: Any, here: int) -> int:
     """Return the place behind the word at `here`."""
-    while not (is_blank(data[here]) or is_end(data[here]) or data[here] == _BACKSLASH):
+    while not (is_blank(data[here]) or is_break(data[here]) or data[here] == _BACKSLASH):
         here += 1
     return here
 
@@ -114,7 +120,7 @@ def read_number(data: Any, start: int) -> tuple[float, int, bool]:
         decimals = here - first
         seen += decimals
     byte = digit + 48
-    plain = is_blank(byte) or is_end(byte)
+    plain = is_blank(byte) or is_break(byte)
     if plain and 0 < seen <= 18 and digits <= 9007199254740992:
         # Both are exact in float64, so the one rounding is the right one (Clinger, PLDI 1990).
         value = np.float64(digits) / _TEN[decimals]

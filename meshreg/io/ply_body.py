@@ -7,7 +7,6 @@ into the mapped file.
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,14 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from meshreg.errors import InputError
-from meshreg.io.ply_header import Element, Header, Property
+from meshreg.io.ply_header import Element, Header
+from meshreg.io.ply_text import CUT, fitting, line_of, read_numbers, start_of_row
 from meshreg.types import Float64, UInt8
 
-_CUT = "The file is cut off or damaged; export or copy it again."
-_NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
-_NOT_FINITE = re.compile(
-    r"[+-]?(?:(nan|1\.#(?:qnan|snan|ind)0*)(?:\([a-z0-9]*\))?|inf|infinity|1\.#inf0*)"
-)
 _NO_FLOATS = np.empty(0, np.float64)
 _NO_INTS = np.empty(0, np.int64)
 
@@ -93,7 +88,7 @@ class Table:
         else:
             counts, values = self._gather(number)
         if self.is_text:
-            values = _fitting(values, item, self)
+            values = fitting(values, item, self.element.name, self.file)
         return (counts if item.count_kind else None), values
 
     def _gather(self, number: int) -> tuple[NDArray[np.int64], NDArray[Any]]:
@@ -140,7 +135,7 @@ def read_tables(
     rest = data[here:]
     # A few programs end a binary file with a line end.
     if (len(rest) > 2 and header.order) or len(bytes(rest[: 1 << 16]).strip(b" \t\r\n\x1a")):
-        place = f"byte {here}" if header.order else _line_of(data, here)
+        place = f"byte {here}" if header.order else line_of(data, here)
         raise InputError(
             f"goes on for {len(rest)} bytes after the last of its elements.",
             file=path,
@@ -281,14 +276,7 @@ def _broken(table: Table, status: int, row: int, here: int, limit: int) -> Input
     else:
         what = f"is broken in row {row + 1} of {element.name!r}"
     place = f"{element.name} {row + 1}" if table.is_text else f"byte {here}"
-    return InputError(f"{what}.", file=table.file, place=place, remedy=_CUT)
-
-
-def _line_of(data: UInt8, here: int) -> str:
-    """Return "line N" of a byte; lines end with LF, CRLF or CR."""
-    text = bytes(data[:here])
-    ends = text.count(b"\n") + text.count(b"\r") - text.count(b"\r\n")
-    return f"line {ends + 1}"
+    return InputError(f"{what}.", file=table.file, place=place, remedy=CUT)
 
 
 def _text(element: Element, data: UInt8, start: int, path: Path, wanted: bool) -> tuple[Table, int]:
@@ -301,12 +289,12 @@ def _text(element: Element, data: UInt8, start: int, path: Path, wanted: bool) -
         raise InputError(
             f"ends after row {found} of {element.count} of element {element.name!r}.",
             file=path,
-            place=_line_of(data, end),
-            remedy=_CUT,
+            place=line_of(data, end),
+            remedy=CUT,
         )
     tokens = _NO_FLOATS
     if wanted and element.count:
-        tokens = _numbers(data, start, end, int(words.sum()), path)
+        tokens = read_numbers(data, start, end, int(words.sum()), path)
     table = Table(element, tokens.view(np.uint8), 0, 0, "<", tokens, None, _NO_INTS, path)
     if not wanted or not element.count:
         return table, end
@@ -314,62 +302,5 @@ def _text(element: Element, data: UInt8, start: int, path: Path, wanted: bool) -
         return _measured(table, 8 * len(tokens), 8 * words), end
     except InputError as error:
         row = int((error.place or "").split()[-1]) if error.place else 1
-        error.place = _line_of(data, _start_of_row(data, start, row))
+        error.place = line_of(data, start_of_row(data, start, row))
         raise
-
-
-def _start_of_row(data: UInt8, start: int, row: int) -> int:
-    """Return the first byte of an element's row (from 1) in text; for error messages."""
-    from meshreg.io.ply_kernels import count_tokens
-
-    end, _ = count_tokens(data, start, row - 1, np.zeros(row - 1, np.int64))
-    here = int(end)
-    while here < len(data) and data[here] in b" \t\r\n":
-        here += 1
-    return here
-
-
-def _numbers(data: UInt8, start: int, end: int, count: int, path: Path) -> Float64:
-    from meshreg.io.ply_kernels import parse_tokens
-
-    out = np.empty(count, np.float64)
-    filled, begin, stop = parse_tokens(data, (start, end), out, 0)
-    while begin >= 0:
-        out[filled] = _number(bytes(data[begin:stop][:200]), data, int(begin), path)
-        filled, begin, stop = parse_tokens(data, (stop, end), out, filled + 1)
-    return out
-
-
-def _number(word: bytes, data: UInt8, here: int, path: Path) -> float:
-    """Read one word that the fast parser left, or refuse it."""
-    text = word.decode("latin-1")
-    if _NUMBER.fullmatch(text):
-        return float(text)
-    special = _NOT_FINITE.fullmatch(text.lower())
-    if special:
-        return np.nan if special[1] else np.inf
-    comma = re.fullmatch(r"[+-]?[0-9]+,[0-9]+(?:[eE][+-]?[0-9]+)?", text)
-    raise InputError(
-        f"has {text[:40]!r} (byte {here}) where a number belongs"
-        + (": a decimal comma." if comma else "."),
-        file=path,
-        place=_line_of(data, here),
-        remedy="Export it with decimal points." if comma else _CUT,
-    )
-
-
-def _fitting(values: Float64, item: Property, table: Table) -> NDArray[Any]:
-    """Turn numbers read from text into the integers that the header declares."""
-    if item.kind[0] == "f":
-        return values
-    limits = np.iinfo(item.kind)
-    good = (values >= limits.min) & (values <= limits.max) & (values == np.floor(values))
-    if not good.all():
-        bad = values[np.flatnonzero(~good)[0]]
-        raise InputError(
-            f"has {bad:g} in property {item.name!r} of {table.element.name!r}, whose type "
-            f"({item.kind}) does not hold it.",
-            file=table.file,
-            remedy="Export it again.",
-        )
-    return values.astype(item.kind)

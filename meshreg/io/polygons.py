@@ -20,6 +20,7 @@ _BENT = 0.05  # a concave polygon further from its plane than this share of its 
 _MAX_CONCAVE = 5000  # corners; ear clipping takes quadratic time
 
 Int64 = NDArray[np.int64]
+Int32 = NDArray[np.int32]
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,26 +162,40 @@ def usable_faces(
     """
     if not len(faces):
         return None, ()
-    from meshreg.io.polygons_kernels import face_keys
+    from meshreg.io.faces_kernels import use_faces
 
-    key, flat, lost = face_keys(points, np.ascontiguousarray(faces))
-    keep = ~(flat | lost)
-    copies = 0
-    ordered = np.sort(key)  # ten times faster than argsort, and mostly enough
-    if (ordered[1:] == ordered[:-1]).any():
-        order = np.argsort(key, kind="stable")
-        same = np.flatnonzero(key[order[1:]] == key[order[:-1]])
-        first, again = order[same], order[same + 1]
-        # Equal keys are only candidates: the key is a hash where there are over 2^21 vertices.
-        equal = (np.sort(faces[first], axis=1) == np.sort(faces[again], axis=1)).all(axis=1)
-        again = again[equal]
-        copies = int(keep[again].sum())
-        keep[again] = False
+    faces = np.ascontiguousarray(faces, np.int32)
+    table = np.full(1 << int(2 * len(faces) - 1).bit_length(), -1, np.int32)
+    keep = np.empty(len(faces), np.bool_)
+    lost, flat, copies = use_faces(np.ascontiguousarray(points, np.float64), faces, table, keep)
     notes = []
-    if lost.any():
-        notes.append(f"{int(lost.sum())} faces touch a vertex that is not finite and were dropped.")
-    if flat.any():
-        notes.append(f"{int(flat.sum())} faces without area were dropped.")
+    if lost:
+        notes.append(f"{lost} faces touch a vertex that is not finite and were dropped.")
+    if flat:
+        notes.append(f"{flat} faces without area were dropped.")
     if copies:
         notes.append(f"{copies} faces that repeat another face's vertices were dropped.")
-    return (None if keep.all() else keep), tuple(notes)
+    return (keep if notes else None), tuple(notes)
+
+
+def weld(points: NDArray[np.float64]) -> tuple[Int32, Int64]:
+    """Find points that are equal in all digits, for formats that repeat them at each face.
+
+    Parameters
+    ----------
+    points : (N, 3) float64
+
+    Returns
+    -------
+    new : (N,) int32
+        Number of each point among the different ones.
+    kept : (M,) int64
+        Row of the first of each, in order.
+    """
+    from meshreg.io.polygons_kernels import weld_points
+
+    table = np.full(1 << int(2 * len(points) + 1).bit_length(), -1, np.int32)
+    new = np.empty(len(points), np.int32)
+    kept = np.empty(len(points), np.int64)
+    count = weld_points(np.ascontiguousarray(points, np.float64), table, new, kept)
+    return new, kept[:count].copy()

@@ -1,4 +1,4 @@
-"""Loops over polygons: ear clipping, and keys by which faces are compared."""
+"""Loops over polygons and points: ear clipping, welding."""
 
 from __future__ import annotations
 
@@ -154,46 +154,45 @@ def cut_concave(
 
 
 @jit(nogil=True)
-def face_keys(points: Any, faces: Any) -> Any:
-    """Give each face a key equal for equal vertex sets, and say which are flat or not finite.
+def weld_points(points: Any, table: Any, new: Any, kept: Any) -> int:
+    """Give equal points one number.
 
-    Returns
-    -------
-    key : (F,) uint64
-        Exact up to 2^21 vertices, a hash above.
-    flat : (F,) bool
-        No area: a repeated vertex, or three corners in line.
-    lost : (F,) bool
-        A corner is NaN or infinite.
+    Parameters
+    ----------
+    points : (N, 3) float64
+    table : (2^k,) int32, all -1
+        At least twice as long as `points`.
+    new : (N,) int32
+        Out: number of each point among the different ones.
+    kept : (N,) int64
+        Out: row of the first of each; as many as are returned.
     """
-    n_faces = len(faces)
-    key = np.empty(n_faces, np.uint64)
-    flat = np.zeros(n_faces, np.bool_)
-    lost = np.zeros(n_faces, np.bool_)
-    exact = len(points) <= 2097152
+    mask = np.uint64(len(table) - 1)
     spread = np.uint64(0x9E3779B97F4A7C15)
-    for row in range(n_faces):
-        a, b, c = faces[row, 0], faces[row, 1], faces[row, 2]
-        low, high = min(a, b, c), max(a, b, c)
-        middle = a + b + c - low - high
-        if exact:
-            packed = np.uint64(low) << np.uint64(42)
-            key[row] = packed | (np.uint64(middle) << np.uint64(21)) | np.uint64(high)
-        else:
-            h = np.uint64(low) * spread
-            h = (h ^ (h >> np.uint64(29)) ^ np.uint64(middle)) * spread
-            h = (h ^ (h >> np.uint64(32)) ^ np.uint64(high)) * spread
-            key[row] = h ^ (h >> np.uint64(29))
-        total = 0.0
-        area = 0.0
-        for i in range(3):
-            j, k = (i + 1) % 3, (i + 2) % 3
-            total += points[a, i] + points[b, i] + points[c, i]
-            part = (points[b, j] - points[a, j]) * (points[c, k] - points[a, k])
-            part -= (points[b, k] - points[a, k]) * (points[c, j] - points[a, j])
-            area += part * part
-        if not np.isfinite(total):
-            lost[row] = True
-        elif middle in (low, high) or area == 0.0:
-            flat[row] = True
-    return key, flat, lost
+    bits = points.view(np.uint64)
+    minus_zero = np.uint64(1) << np.uint64(63)
+    count = 0
+    for row in range(len(points)):
+        mixed = np.uint64(0)
+        for axis in range(3):
+            word = bits[row, axis]
+            if word == minus_zero:  # equal to zero, in other bits
+                word = np.uint64(0)
+            mixed = (mixed ^ word) * spread
+            mixed = mixed ^ (mixed >> np.uint64(32))
+        slot = np.int64(mixed & mask)
+        while table[slot] >= 0:
+            other = kept[table[slot]]
+            if (
+                points[other, 0] == points[row, 0]
+                and points[other, 1] == points[row, 1]
+                and points[other, 2] == points[row, 2]
+            ):
+                break
+            slot = (slot + 1) & np.int64(mask)
+        if table[slot] < 0:
+            table[slot] = count
+            kept[count] = row
+            count += 1
+        new[row] = table[slot]
+    return count

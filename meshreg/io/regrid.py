@@ -65,7 +65,8 @@ def covering_grid(placed: Placed, crs: str | None, cell: float | None = None) ->
     if cell is None:
         middle = np.array([cols / 2, rows / 2])
         here = placed.absolute(*(middle[:, None] + np.array([[0, 1, 0], [0, 0, 1]])))[:, :2]
-        cell = float(np.sqrt(abs(np.linalg.det(here[1:] - here[0]))))
+        # A round number: differences of large coordinates end in digits that mean nothing.
+        cell = float(f"{np.sqrt(abs(np.linalg.det(here[1:] - here[0]))):.6g}")
     if not (np.isfinite(edge).all() and cell > 0):
         raise InputError("cannot be laid on a map: its corners are not finite there.")
     # Edges that are whole multiples already must not gain a row by rounding.

@@ -119,6 +119,29 @@ class Extent:
             )
 
 
+def require_close(
+    found: NDArray[Any], expected: NDArray[Any], tolerance: float, path: Path
+) -> None:
+    """Check points read back from `path` one by one; those that are not finite are left out.
+
+    Raises
+    ------
+    OutputError
+        Their number differs, or one of them is off by more than `tolerance`.
+    """
+    off = float("inf")
+    if found.shape == expected.shape:
+        finite = np.isfinite(expected).all(axis=1)
+        off = float(np.abs(found[finite] - expected[finite]).max(initial=0))
+    if not off <= tolerance:
+        raise OutputError(
+            f"does not read back as written: {len(found)} points of {len(expected)}, "
+            f"off by up to {off:.3g}.",
+            file=path,
+            remedy="Check the disk and run again.",
+        )
+
+
 def warn(path: Path, note: str) -> None:
     """Log what a rewriter changed beside coordinates."""
     _LOG.warning("%s: %s", path.name, note)

@@ -6,6 +6,7 @@ declared count through `require`; every writer goes through `atomic_file` or `at
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import os
 import re
@@ -136,11 +137,7 @@ def _entry(folder: Path, part: str, shown: str) -> str | None:
     """Return the entry of `folder` called `part`, else the only one that folds to it."""
     if os.path.lexists(folder / part):
         return part
-
-    def folded(text: str) -> str:
-        return unicodedata.normalize("NFC", unicodedata.normalize("NFC", text).casefold())
-
-    fits = [entry for entry in os.listdir(folder) if folded(entry) == folded(part)]
+    fits = _listing(folder, os.stat(folder).st_mtime_ns).get(_folded(part), [])
     if len(fits) > 1:
         raise MissingReferenceError(
             f"the reference {shown!r} fits several files: {', '.join(sorted(fits))}.",
@@ -148,6 +145,20 @@ def _entry(folder: Path, part: str, shown: str) -> str | None:
             remedy="Keep one of them, under the name that is referred to.",
         )
     return fits[0] if fits else None
+
+
+def _folded(text: str) -> str:
+    return unicodedata.normalize("NFC", unicodedata.normalize("NFC", text).casefold())
+
+
+@functools.lru_cache(maxsize=16)
+def _listing(folder: Path, changed: int) -> dict[str, list[str]]:
+    """Return a folder's entries by folded name; kept, as a file may name thousands of pages."""
+    del changed  # only makes the cache forget
+    entries: dict[str, list[str]] = {}
+    for entry in os.listdir(folder):
+        entries.setdefault(_folded(entry), []).append(entry)
+    return entries
 
 
 def open_regular(path: Path) -> BinaryIO:

@@ -16,9 +16,11 @@ from typing import Any
 
 import numpy as np
 
-from meshreg.errors import InputError, OutputError
-from meshreg.io.safe import atomic_file, decode_name, open_regular
-from meshreg.types import Frame
+from meshreg.errors import InputError
+from meshreg.io.safe import decode_name, open_regular
+from meshreg.io.sidecar_write import write_shift
+
+__all__ = ["SidecarInfo", "find_sidecar", "is_sidecar", "write_shift"]
 
 _LOG = logging.getLogger("meshreg")
 _MAX_BYTES = 1 << 20  # coords.txt lists every photograph; the rest are a few lines
@@ -296,7 +298,7 @@ def _read_toml(path: Path) -> SidecarInfo:
 
 def _check_key(path: Path, key: str, value: Any) -> None:
     """Refuse a key or a value that cannot be meant, rather than read the survey elsewhere."""
-    from meshreg.io.frames import UNITS
+    from meshreg.io.framing import UNITS
 
     def numbers(items: Any) -> bool:
         return (
@@ -332,77 +334,3 @@ def _check_key(path: Path, key: str, value: Any) -> None:
     expected, fits = wanted[key]
     if not fits:
         raise InputError(f"{key} = {value!r}; expected {expected}.", file=path)
-
-
-def write_shift(path: Path, frame: Frame, *, carries_crs: bool = False) -> tuple[Path, ...]:
-    """Write beside `path` what its coordinates do not say themselves.
-
-    `<stem>_offset.xyz` (as Pix4D, three numbers with 17 digits) where a shift is all there is to
-    add; `<stem>.survey.toml` where axes, unit or CRS need saying too. Older ones of that name are
-    replaced or removed, so that nothing stale is left to disagree.
-
-    Parameters
-    ----------
-    path : Path
-        The survey file.
-    frame : Frame
-    carries_crs : bool
-        The format states its CRS itself.
-
-    Returns
-    -------
-    tuple of Path
-        Files written, perhaps none.
-    """
-    import tomli_w
-
-    path = Path(path)
-    stem = path.name[: -len(".copc.laz")] if path.name.endswith(".copc.laz") else path.stem
-    offset, survey = path.with_name(f"{stem}_offset.xyz"), path.with_name(f"{stem}.survey.toml")
-    said = _frame_words(frame)
-    plain = not said
-    if frame.file_crs is not None and not carries_crs:
-        said["crs"] = frame.file_crs
-    shift = [float(value) for value in frame.shift]
-    written = []
-    if plain and any(shift):
-        with atomic_file(offset) as temporary:
-            temporary.write_text(" ".join(f"{value:.17g}" for value in shift) + "\n", "ascii")
-        written.append(offset)
-    else:
-        _remove(offset)
-    if said:
-        with atomic_file(survey) as temporary:
-            temporary.write_text(tomli_w.dumps({"shift": shift, **said}), "utf-8")
-        written.append(survey)
-    else:
-        _remove(survey)
-    return tuple(written)
-
-
-def _remove(path: Path) -> None:
-    try:
-        path.unlink(missing_ok=True)
-    except OSError as error:
-        raise OutputError(f"cannot be removed: {error.strerror}.", file=path) from error
-
-
-def _frame_words(frame: Frame) -> dict[str, Any]:
-    """Return `axes`, `up` and `unit` of a frame as a .survey.toml says them; empty if plain."""
-    from meshreg.io.crs import metres_per_unit
-    from meshreg.io.frames import ENU, NED, UNITS, Y_UP
-
-    length = float(np.cbrt(abs(np.linalg.det(frame.axes))))
-    words: dict[str, Any] = {}
-    for axes, word in ((ENU, {}), (NED, {"axes": "ned"}), (Y_UP, {"up": "y"})):
-        if np.allclose(frame.axes, length * axes, rtol=1e-12, atol=0):
-            words |= word
-            break
-    else:
-        length = 1.0
-        words["axes"] = [[float(value) for value in row] for row in frame.axes]
-    metres = length * (metres_per_unit(frame.file_crs) if frame.file_crs else 1.0)
-    if abs(length - 1) > 1e-12:
-        names = [name for name, value in UNITS.items() if abs(value / metres - 1) < 1e-12]
-        words["unit"] = names[0] if names else metres
-    return words

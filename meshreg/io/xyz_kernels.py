@@ -27,7 +27,7 @@ def _line_end(data: Any, here: int) -> tuple[int, int]:
 
 @jit(nogil=True)
 def _is_blank(byte: int) -> bool:
-    return byte == 32 or byte == 9
+    return byte in (32, 9)
 
 
 @jit(nogil=True)
@@ -56,7 +56,7 @@ def count_rows(data: Any, start: int) -> int:
 @jit(nogil=True)
 def _field(data: Any, here: int, end: int, delimiter: int) -> tuple[int, int, int]:
     """Return start and end of the field at `here`, blanks taken off, and where the next one is."""
-    while here < end and _is_blank(data[here]) and data[here] != delimiter:
+    while here < end and _is_blank(data[here]) and (delimiter == 32 or data[here] != delimiter):
         here += 1
     if delimiter == 32:
         stop = here
@@ -139,3 +139,102 @@ def parse_rows(
         line += 1
     state[0], state[1], state[2] = here, line, row
     return count, 0
+
+
+@jit(nogil=True)
+def _put_number(out: Any, at: int, value: float, decimals: int) -> int:
+    """Write a number with fixed decimals (fewer where 17 digits do not suffice); return the end."""
+    size = abs(value)
+    scaled = np.rint(size * 10.0**decimals)
+    while scaled > 9e15 and decimals > 0:
+        decimals -= 1
+        scaled = np.rint(size * 10.0**decimals)
+    digits = np.int64(scaled)
+    if value < 0 and digits > 0:
+        out[at] = 45
+        at += 1
+    width = 1
+    rest = digits // 10
+    while rest > 0:
+        width += 1
+        rest //= 10
+    width = max(width, decimals + 1)
+    last = at + width + (decimals > 0)
+    here = last - 1
+    for place in range(width):
+        if place == decimals and decimals > 0:
+            out[here] = 46
+            here -= 1
+        out[here] = 48 + digits % 10
+        digits //= 10
+        here -= 1
+    return last
+
+
+@jit(nogil=True)
+def _decimals(data: Any, start: int, end: int) -> int:
+    """Count the decimals of a plain number; 0 where it has none or is in powers of ten."""
+    for here in range(start, end):
+        if data[here] == 46:
+            for behind in range(here + 1, end):
+                if not 48 <= data[behind] <= 57:
+                    return 0
+            return end - here - 1
+    return 0
+
+
+@jit(nogil=True)
+def splice_rows(
+    data: Any, state: Any, delimiter: int, columns: Any, numbers: Any, least: Any, out: Any
+) -> int:
+    """Copy lines, with the fields of some columns replaced, until the end or until `out` is full.
+
+    Parameters
+    ----------
+    data : (size,) uint8
+    state : (2,) int64
+        Where to start: byte, row of `numbers`. Updated to where it stopped.
+    delimiter : int
+        As for `parse_rows`, which has found every row to be of the same width.
+    columns : (K,) int64
+        Ascending.
+    numbers : (rows, K) float64
+        What is not finite leaves its field as it is.
+    least : (K,) int64
+        Decimals to write; more where the field had more.
+    out : (capacity,) uint8
+
+    Returns
+    -------
+    int
+        Bytes written; 0 if `out` is too small for one line.
+    """
+    here, row = state
+    at = 0
+    while here < len(data):
+        end, after = _line_end(data, here)
+        if at + (after - here) + 40 * len(columns) > len(out):
+            break
+        copied = here
+        if _is_data(data, here, end):
+            field, column, k = here, 0, 0
+            while k < len(columns):
+                first, last, field = _field(data, field, end, delimiter)
+                if column == columns[k]:
+                    value = numbers[row, k]
+                    if np.isfinite(value):
+                        for byte in data[copied:first]:
+                            out[at] = byte
+                            at += 1
+                        digits = min(max(least[k], _decimals(data, first, last)), 15)
+                        at = _put_number(out, at, value, digits)
+                        copied = last
+                    k += 1
+                column += 1
+            row += 1
+        for byte in data[copied : min(after, len(data))]:
+            out[at] = byte
+            at += 1
+        here = after
+    state[0], state[1] = here, row
+    return at

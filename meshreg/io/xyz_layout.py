@@ -17,6 +17,7 @@ _HEAD = 1 << 20  # bytes looked at to understand the file
 _SAMPLE = 200  # lines
 _DELIMITERS = (";", "\t", ",", " ")
 _DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+(e[+-]?\d+)?", re.IGNORECASE)
+_SPACED_COMMAS = re.compile(r"[+-]?\d+,\d+(,\s+[+-]?\d+,\d+)+")  # "1,5, 2,5, 3,5"
 _NAMES = {
     "x": ("x", "east", "easting", "e", "xcoord", "coordx", "coordinatex", "utmx", "utme"),
     "y": ("y", "north", "northing", "n", "ycoord", "coordy", "coordinatey", "utmy", "utmn"),
@@ -157,7 +158,8 @@ def _understand(
         rows = rows[1:]
     else:
         delimiter, columns = _delimiter(rows, path)
-        header = next((n for n in map(_names_in, reversed(comments)) if _has_xyz(n)), None)
+        words = [_names_in(comment) for comment in reversed(comments)]
+        header = next((n for n in words if len(n) == columns and _has_xyz(n)), None)
     if header is None:
         where = {name: k for k, name in enumerate("xyz")}
         return Layout(offset, number, delimiter, columns, where, count=count, guessed=True)
@@ -182,8 +184,9 @@ def _understand(
             place="header",
             remedy="Name them x, y, z (or easting, northing, elevation or depth).",
         )
-    kept = {k: where[k] for k in ("x", "y", "z", "r", "g", "b", "nx", "ny", "nz") if k in where}
-    return Layout(offset, number, delimiter, columns, kept, down, lonlat, count)
+    for unused in ("lon", "lat", "depth"):
+        where.pop(unused, None)
+    return Layout(offset, number, delimiter, columns, where, down, lonlat, count)
 
 
 def _names_in(comment: str) -> list[str]:
@@ -222,7 +225,7 @@ def _delimiter(rows: Sequence[str], path: Path) -> tuple[str, int]:
     A later row of another width is found when all are read, with its line.
     """
     fits = []
-    for delimiter in _DELIMITERS:
+    for delimiter in _DELIMITERS if not _SPACED_COMMAS.fullmatch(rows[0]) else ():
         widths = [len(split(row, delimiter)) for row in rows]
         width = max(set(widths), key=widths.count)
         example = split(rows[widths.index(width)], delimiter)
@@ -232,7 +235,8 @@ def _delimiter(rows: Sequence[str], path: Path) -> tuple[str, int]:
         best = max(fits, key=lambda fit: fit[0])
         return best[1], best[2]
     for delimiter in (";", "\t", " "):
-        if sum(bool(_DECIMAL_COMMA.fullmatch(word)) for word in split(rows[0], delimiter)) >= 2:
+        words = [word.rstrip(",") for word in split(rows[0], delimiter)]
+        if sum(bool(_DECIMAL_COMMA.fullmatch(word)) for word in words) >= 2:
             raise InputError(
                 "has numbers with a decimal comma.",
                 file=path,

@@ -149,6 +149,8 @@ def _exhaustive(
     window: Window,
 ) -> OffsetEstimate:
     """Turn a scanned surface into an estimate; the same rules for each exhaustive search."""
+    if window.empty:
+        return failed(method, "the surveys do not overlap within the search window")
     peak, score, evidence = scan(reference, moving, settings, window)
     evidence = dict(evidence) | {"east": window.east, "north": window.north}
     counts = evidence.pop("counts")

@@ -80,6 +80,14 @@ class Window:
         )
 
     @property
+    def empty(self) -> bool:
+        """Whether the rasters do not overlap at any offset of the window."""
+        for axis, shifts in enumerate((self.rows, self.cols)):
+            if shifts[0] >= self.shapes[0][axis] or shifts[-1] <= -self.shapes[1][axis]:
+                return True
+        return False
+
+    @property
     def padded(self) -> tuple[int, int]:
         """Smallest FFT size at which no offset in the window wraps round."""
         from scipy.fft import next_fast_len

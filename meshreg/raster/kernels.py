@@ -1,4 +1,4 @@
-"""Numba loops of the mesh rasterizer: bin faces to bands, draw the top surface, average, shade.
+"""Numba loops of the mesh rasterizer: bin faces to bands, draw the top surface, average.
 
 Coordinates are in samples of the fine lattice: column x to the east, row y to the south, whole
 numbers at sample centres, height z in metres above the raster's datum. A cell is `times` by
@@ -9,13 +9,41 @@ rising order, so nothing depends on scheduling or on the number of threads.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from meshreg.jit import jit, prange
-from meshreg.types import Bool, Float32, Float64, Int32, UInt8
+from meshreg.raster.shade_kernels import (
+    BandPlace,
+    ColorSums,
+    MeshArrays,
+    Pages,
+    shade_textures,
+    shade_vertices,
+)
+from meshreg.types import Bool, Float32, Float64, Int32
 
+UInt16 = NDArray[np.uint16]
+Int64 = NDArray[np.int64]
 _CHUNK = 65536  # faces to a unit of work; fixed, so that sums do not depend on the thread count
+
+
+class BandFaces(NamedTuple):
+    """The faces of band b, in rising order: ``members[starts[b]:starts[b + 1]]``."""
+
+    starts: Int64
+    members: Int32
+
+
+class Lattice(NamedTuple):
+    """Cell rows `first` up to `last`, in bands of `band_rows` (a divisor of `first`)."""
+
+    first: int
+    last: int
+    band_rows: int
+    times: int
 
 
 @jit(parallel=True, nogil=True)
@@ -73,8 +101,8 @@ def face_bands(
 
 
 @jit(parallel=True, nogil=True)
-def band_members(bands: Int32, n_bands: int) -> tuple[np.ndarray, Int32]:
-    """Return `starts` (n_bands + 1,) and `members`: the faces of each band, in rising order."""
+def band_members(bands: Int32, n_bands: int) -> BandFaces:
+    """Sort the faces to the bands that they touch (a stable counting sort, in parallel)."""
     n_faces = bands.shape[0]
     n_chunks = (n_faces + _CHUNK - 1) // _CHUNK
     places = np.zeros((n_chunks, n_bands), np.int64)
@@ -99,7 +127,7 @@ def band_members(bands: Int32, n_bands: int) -> tuple[np.ndarray, Int32]:
                 for band in range(bands[f, 0], bands[f, 1] + 1):
                     members[places[chunk, band]] = f
                     places[chunk, band] += 1
-    return starts, members
+    return BandFaces(starts, members)
 
 
 @jit(nogil=True)
@@ -159,7 +187,7 @@ def _draw_face(
 
 @jit(nogil=True)
 def _average_heights(
-    depth: Float32, owner: Int32, times: int, height: Float32, samples: np.ndarray
+    depth: Float32, owner: Int32, times: int, height: Float32, samples: UInt16
 ) -> None:
     """Write the mean height and the count of samples of each cell of a band."""
     for row in range(height.shape[0]):
@@ -174,219 +202,31 @@ def _average_heights(
             height[row, col] = total / count if count else np.nan
 
 
-@jit(nogil=True)
-def _texel_plane(
-    points: Float64, faces: Int32, uv: Float32, face: int, sx: float, sy: float, plane: Float64
-) -> None:
-    """Set `plane` to texel x = p0 + p1 col + p2 row, y = p3 + p4 col + p5 row, and their limits."""
-    a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]
-    ax, ay = points[a, 0], points[a, 1]
-    bx, by = points[b, 0] - ax, points[b, 1] - ay
-    cx, cy = points[c, 0] - ax, points[c, 1] - ay
-    scale = 1.0 / (bx * cy - cx * by)
-    for k in range(2):
-        if k == 0:
-            p, q, r = uv[face, 0, 0] * sx, uv[face, 1, 0] * sx, uv[face, 2, 0] * sx
-        else:
-            p, q = (1.0 - uv[face, 0, 1]) * sy, (1.0 - uv[face, 1, 1]) * sy
-            r = (1.0 - uv[face, 2, 1]) * sy
-        along_x = ((q - p) * cy - (r - p) * by) * scale
-        along_y = (bx * (r - p) - cx * (q - p)) * scale
-        plane[3 * k] = p - along_x * ax - along_y * ay
-        plane[3 * k + 1] = along_x
-        plane[3 * k + 2] = along_y
-        plane[6 + 2 * k] = min(p, q, r)
-        plane[7 + 2 * k] = max(p, q, r)
-
-
-@jit(nogil=True)
-def _neighbours(x: float, size: int, wrap: bool) -> tuple[int, int, float]:
-    """Return the two texels whose centres lie around `x` [texels], and the share of the second."""
-    x -= 0.5  # texel 0 spans 0 to 1: its centre is at 0.5
-    first = math.floor(x)
-    share = x - first
-    second = first + 1
-    if wrap:
-        return first % size, second % size, share
-    return min(max(first, 0), size - 1), min(max(second, 0), size - 1), share
-
-
-@jit(nogil=True)
-def _texel_mean(
-    pixels: UInt8, seen: UInt8, offset: int, width: int, height: int, wrap: bool, x: float, y: float
-) -> tuple[int, int, int]:
-    """Bilinear color times 65536 at texel coordinates (x, y) of one page, over the seen texels.
-
-    Red is -1 when the nearest texel is not seen. The page starts at texel `offset` of `pixels`.
-    Whole numbers: fast, and their sums do not depend on order.
-    """
-    left, right, fx = _neighbours(x, width, wrap)
-    top, bottom, fy = _neighbours(y, height, wrap)
-    nw, ne = offset + top * width + left, offset + top * width + right
-    sw, se = offset + bottom * width + left, offset + bottom * width + right
-    fx *= 65536.0
-    w_se = int(fx * fy)
-    w_sw = int(65536.0 * fy) - w_se
-    w_ne = int(fx) - w_se
-    if seen.size > 0:
-        w_nw = 65536 - w_se - w_sw - w_ne
-        near = (sw if fx < 32768.0 else se) if fy >= 0.5 else (nw if fx < 32768.0 else ne)
-        if seen[near] == 0:
-            return -1, 0, 0
-        w_nw, w_ne, w_sw, w_se = w_nw * seen[nw], w_ne * seen[ne], w_sw * seen[sw], w_se * seen[se]
-        scale = 65536.0 / (w_nw + w_ne + w_sw + w_se)
-        w_ne, w_sw, w_se = int(w_ne * scale), int(w_sw * scale), int(w_se * scale)
-    w_nw = 65536 - w_se - w_sw - w_ne
-    nw, ne, sw, se = 3 * nw, 3 * ne, 3 * sw, 3 * se
-    red = w_nw * pixels[nw] + w_ne * pixels[ne] + w_sw * pixels[sw] + w_se * pixels[se]
-    nw, ne, sw, se = nw + 1, ne + 1, sw + 1, se + 1
-    green = w_nw * pixels[nw] + w_ne * pixels[ne] + w_sw * pixels[sw] + w_se * pixels[se]
-    nw, ne, sw, se = nw + 1, ne + 1, sw + 1, se + 1
-    blue = w_nw * pixels[nw] + w_ne * pixels[ne] + w_sw * pixels[sw] + w_se * pixels[se]
-    return red, green, blue
-
-
-@jit(nogil=True)
-def _add_colors(
-    row: int, col: int, red: float, green: float, blue: float, count: int, low: int, high: int,
-    totals: Float32, tallies: np.ndarray,
-) -> None:  # fmt: skip
-    """Add `count` samples to a cell: sums of the colors, lowest and highest r + g + b."""
-    totals[row, col, 0] += red
-    totals[row, col, 1] += green
-    totals[row, col, 2] += blue
-    tallies[row, col, 0] += count
-    tallies[row, col, 1] = min(tallies[row, col, 1], low)
-    tallies[row, col, 2] = max(tallies[row, col, 2], high)
-
-
-@jit(nogil=True)
-def _shade_textures(
-    points: Float64, faces: Int32, uv: Float32, face_page: Int32, pages: Float64,
-    pixels: UInt8, seen: UInt8, owner: Int32, row0: int, times: int, first_row: int,
-    totals: Float32, tallies: np.ndarray,
-) -> None:  # fmt: skip
-    """Add the colors of a band's visible samples that lie on the pages in memory.
-
-    A row of `pages` is (offset in texels or -1, width, height, wrap, scale x, scale y).
-    """
-    plane = np.empty(10, np.float64)
-    offset = width = height = 0
-    wrap = here = False
-    for i in range(owner.shape[0]):
-        last = -1
-        y = float(i + row0)
-        row = first_row + i // times
-        for col in range(owner.shape[1] // times):
-            red = green = blue = 0
-            count, low, high = 0, 765, 0
-            for j in range(col * times, (col + 1) * times):
-                face = owner[i, j]
-                if face < 0:
-                    continue
-                if face != last:
-                    last = face
-                    page = face_page[face]
-                    here = page >= 0 and pages[page, 0] >= 0.0
-                    if here:
-                        offset, wrap = int(pages[page, 0]), pages[page, 3] > 0.0
-                        width, height = int(pages[page, 1]), int(pages[page, 2])
-                        sx, sy = pages[page, 4], pages[page, 5]
-                        _texel_plane(points, faces, uv, face, sx, sy, plane)
-                if not here:
-                    continue
-                u = min(max(plane[0] + plane[1] * j + plane[2] * y, plane[6]), plane[7])
-                v = min(max(plane[3] + plane[4] * j + plane[5] * y, plane[8]), plane[9])
-                r, g, b = _texel_mean(pixels, seen, offset, width, height, wrap, u, v)
-                if r >= 0:
-                    red, green, blue = red + r, green + g, blue + b
-                    grey = (r + g + b + 32768) >> 16
-                    count, low, high = count + 1, min(low, grey), max(high, grey)
-            if count > 0:
-                _add_colors(row, col, red / 65536, green / 65536, blue / 65536, count, low, high, totals, tallies)
-
-
-@jit(nogil=True)
-def _shade_vertices(
-    points: Float64, faces: Int32, colors: UInt8, face_page: Int32,
-    owner: Int32, row0: int, times: int, first_row: int, totals: Float32, tallies: np.ndarray,
-) -> None:  # fmt: skip
-    """Add the interpolated vertex colors of a band's visible samples that have no page."""
-    rgb = np.empty(3, np.float64)
-    for i in range(owner.shape[0]):
-        for j in range(owner.shape[1]):
-            face = owner[i, j]
-            if face < 0 or (face_page.size > 0 and face_page[face] >= 0):
-                continue
-            a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]
-            ax, ay = points[a, 0], points[a, 1]
-            bx, by = points[b, 0] - ax, points[b, 1] - ay
-            cx, cy = points[c, 0] - ax, points[c, 1] - ay
-            x, y = j - ax, i + row0 - ay
-            area = bx * cy - cx * by
-            second = min(max((x * cy - cx * y) / area, 0.0), 1.0)
-            third = min(max((bx * y - x * by) / area, 0.0), 1.0 - second)
-            first = 1.0 - second - third
-            for k in range(3):
-                rgb[k] = first * colors[a, k] + second * colors[b, k] + third * colors[c, k]
-            grey = int(rgb[0] + rgb[1] + rgb[2] + 0.5)
-            row, col = first_row + i // times, j // times
-            _add_colors(row, col, rgb[0], rgb[1], rgb[2], 1, grey, grey, totals, tallies)
-
-
 @jit(parallel=True, nogil=True)
 def render(
-    points: Float64, faces: Int32, starts: np.ndarray, members: Int32,
-    rows: tuple[int, int], band_rows: int, times: int,
-    height: Float32, samples: np.ndarray,
-    uv: Float32, face_page: Int32, pages: Float64, pixels: UInt8, seen: UInt8,
-    colors: UInt8, totals: Float32, tallies: np.ndarray,
+    mesh: MeshArrays, faces_of: BandFaces, lattice: Lattice,
+    height: Float32, samples: UInt16, pages: Pages, sums: ColorSums,
 ) -> None:  # fmt: skip
-    """Draw cell rows `rows` = (first, past the last); `rows[0]` is a multiple of `band_rows`.
+    """Draw the cell rows of `lattice`: mean heights, counts of samples and sums of colors.
 
-    `height` and `samples` are those of the whole raster, `totals` and `tallies` (color sums, and
-    what `_add_colors` says) start at ``rows[0]``. Empty arrays switch a part off: `height` when
-    the heights are known already, `pixels` without pages in memory, `colors` without vertex
-    colors.
+    `height` and `samples` are those of the whole raster, `sums` starts at the first row. Empty
+    arrays switch a part off: `height` when the heights are known already, `pages.pixels` without
+    pages in memory, `mesh.colors` without vertex colors.
     """
-    n_cols = samples.shape[1]
-    n_bands = (rows[1] - rows[0] + band_rows - 1) // band_rows
+    times, n_cols = lattice.times, samples.shape[1]
+    n_bands = (lattice.last - lattice.first + lattice.band_rows - 1) // lattice.band_rows
     for k in prange(n_bands):
-        top = rows[0] + k * band_rows
-        bottom = min(top + band_rows, rows[1])
-        row0 = top * times
+        top = lattice.first + k * lattice.band_rows
+        bottom = min(top + lattice.band_rows, lattice.last)
         depth = np.full(((bottom - top) * times, n_cols * times), -np.inf, np.float32)
         owner = np.full(((bottom - top) * times, n_cols * times), -1, np.int32)
-        band = top // band_rows
-        for m in range(starts[band], starts[band + 1]):
-            _draw_face(points, faces, members[m], row0, depth, owner)
+        band = top // lattice.band_rows
+        for m in range(faces_of.starts[band], faces_of.starts[band + 1]):
+            _draw_face(mesh.points, mesh.faces, faces_of.members[m], top * times, depth, owner)
         if height.size > 0:
             _average_heights(depth, owner, times, height[top:bottom], samples[top:bottom])
-        if pixels.size > 0:
-            _shade_textures(
-                points, faces, uv, face_page, pages, pixels, seen, owner, row0, times,
-                top - rows[0], totals, tallies,
-            )  # fmt: skip
-        if colors.size > 0:
-            _shade_vertices(
-                points, faces, colors, face_page, owner, row0, times, top - rows[0],
-                totals, tallies,
-            )  # fmt: skip
-
-
-@jit(parallel=True, nogil=True)
-def color_means(
-    totals: Float32, tallies: np.ndarray, least: int, color: UInt8, valid: Bool, still: Bool
-) -> None:
-    """Turn color sums into means where at least `least` samples were seen.
-
-    `still` is set where all samples of a cell have one and the same color.
-    """
-    for row in prange(totals.shape[0]):
-        for col in range(totals.shape[1]):
-            count = tallies[row, col, 0]
-            if count > 0 and count >= least:
-                valid[row, col] = True
-                still[row, col] = tallies[row, col, 1] == tallies[row, col, 2]
-                for k in range(3):
-                    color[row, col, k] = int(totals[row, col, k] / count + 0.5)
+        place = BandPlace(top * times, times, top - lattice.first)
+        if pages.pixels.size > 0:
+            shade_textures(mesh, pages, owner, place, sums)
+        if mesh.colors.size > 0:
+            shade_vertices(mesh, owner, place, sums)

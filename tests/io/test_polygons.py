@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from meshreg.errors import InputError
 from meshreg.io.assemble import eight_bit_colors
 from meshreg.io.numbers_kernels import parse_number
-from meshreg.io.polygons import triangulate, usable_faces
+from meshreg.io.polygons import triangulate, usable_faces, weld
 
 
 def star(radii, turn=(0, 1, 2), at=(0.0, 0.0, 0.0)):
@@ -103,14 +103,14 @@ def test_usable_faces_equal_their_twin(faces):
     assert told == len(faces) - len(rows)
 
 
-def test_hashed_keys_find_the_same_copies():
-    rng = np.random.default_rng(0)
-    points = rng.normal(size=(2_100_000, 3))
-    faces = np.array([[0, 1, 2], [2_099_999, 5, 7], [7, 2_099_999, 5], [2, 1, 0], [0, 1, 3]])
-    keep, notes = usable_faces(points, faces.astype(np.int32))
-    assert keep is not None
-    assert keep.tolist() == [True, True, False, False, True]
-    assert notes == ("2 faces that repeat another face's vertices were dropped.",)
+@given(st.lists(st.tuples(*[st.sampled_from([0.0, -0.0, 1.5, -2.0, 1e-300])] * 3), max_size=40))
+@settings(max_examples=60, deadline=None)
+def test_weld_numbers_equal_points_alike(rows):
+    points = np.array(rows, np.float64).reshape(-1, 3)
+    new, kept = weld(points)
+    different = list(dict.fromkeys(tuple(row) for row in points.tolist()))  # 0.0 == -0.0
+    assert [tuple(row) for row in points[kept].tolist()] == different
+    assert [different[k] for k in new] == [tuple(row) for row in points.tolist()]
 
 
 def parse(text):

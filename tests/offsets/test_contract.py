@@ -129,10 +129,10 @@ def test_empty_fails_with_a_reason(method):
 @pytest.mark.parametrize("method", METHODS)
 def test_surveys_far_apart_fail_with_a_reason(method):
     reference, moving = pair(method)
-    grid = dataclasses.replace(moving.grid, west=moving.grid.west + 40.0)
+    grid = dataclasses.replace(moving.grid, west=moving.grid.west + 4e6)
     estimate = estimate_offset(reference, dataclasses.replace(moving, grid=grid), method, small())
     assert estimate.status == "failed"
-    assert estimate.reason
+    assert "overlap" in estimate.reason or "matches" in estimate.reason
 
 
 @pytest.mark.parametrize("method", ["terrain", "mutual_information"])

@@ -1,0 +1,117 @@
+"""WRITE glTF: a moved copy of a .glb or .gltf, by one more node above each root."""
+
+from __future__ import annotations
+
+import copy
+import json
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from meshreg.errors import InputError
+from meshreg.io.gltf_document import Document, read_document
+from meshreg.io.gltf_nodes import roots_of, scene_roots
+from meshreg.io.gltf_parts import read_geometry
+from meshreg.io.gltf_write import padded, require_size
+from meshreg.io.mover import Mover
+from meshreg.io.rewriting import (
+    copy_companions,
+    metres_per_file_unit,
+    require_close,
+    require_unchanged,
+)
+from meshreg.io.safe import atomic_file, file_bytes
+from meshreg.types import Float64, SourceFile
+
+_BENT = 1e-3  # most that a change of CRS may bend a survey moved by one matrix [m]
+_BLOCK = 1 << 24
+
+
+def rewrite(source: SourceFile, move: Mover, path: Path) -> tuple[Path, ...]:
+    """Write a moved copy of a .glb or .gltf: the transform goes into a node above each root.
+
+    Geometry, textures and everything else stay as they are.
+
+    Parameters
+    ----------
+    source : SourceFile
+    move : Mover
+    path : Path
+        Of the same suffix as the source.
+
+    Returns
+    -------
+    tuple of Path
+        The file, then copies of the files that it names.
+
+    Raises
+    ------
+    InputError
+        The source is not what it was when read, or the change of CRS bends it by over 1 mm.
+    OutputError
+        It cannot be written, or does not read back as written.
+    """
+    require_unchanged(source, path)
+    document = read_document(source.path)
+    points = read_geometry(document)
+    expected = _moved(document, move, points)
+    tree = _with_matrix(document, move.matrix)
+    text = json.dumps(tree, ensure_ascii=False, allow_nan=False, separators=(",", ":")).encode()
+    copies = copy_companions(source, path)
+    with atomic_file(path) as temporary:
+        with open(temporary, "wb") as stream:
+            if document.is_binary:
+                data, (start, end) = file_bytes(source.path), document.rest
+                text = padded(text)
+                total = 20 + len(text) + end - start
+                require_size(total, path)
+                stream.write(struct.pack("<4sIIII", b"glTF", 2, total, len(text), 0x4E4F534A))
+                stream.write(text)
+                for here in range(start, end, _BLOCK):
+                    stream.write(data[here : min(here + _BLOCK, end)].data)
+            else:
+                stream.write(text)
+        again = read_geometry(read_document(temporary))
+        tolerance = 1e-12 * (np.abs(expected).max(initial=0) + np.abs(points).max(initial=0))
+        require_close(again, expected, tolerance, path)
+    return (path, *copies)
+
+
+def _moved(document: Document, move: Mover, points: Float64) -> Float64:
+    """Move all points by the matrix, after making sure that it says what the mover does."""
+    moved = points @ move.matrix[:3, :3].T + move.matrix[:3, 3]
+    finite = np.flatnonzero(np.isfinite(points).all(axis=1))
+    sample = finite[:: max(1, len(finite) // 1000)]
+    off = np.abs(move.points(points[sample]) - moved[sample]).max() if len(sample) else 0.0
+    off *= metres_per_file_unit(move)
+    if not off <= _BENT:
+        raise InputError(
+            f"would be bent by {off:.3g} m on its way to the other CRS; the matrix of a glTF node "
+            "cannot do that.",
+            file=document.path,
+            remedy="Convert it to .ply or .obj first.",
+        )
+    return moved
+
+
+def _with_matrix(document: Document, matrix: Float64) -> dict[str, Any]:
+    """Return the JSON with a node of that matrix above each root node of each scene."""
+    tree = copy.deepcopy(document.tree)
+    nodes = tree.setdefault("nodes", [])
+    above: dict[int, int] = {}
+    scenes = tree.get("scenes")
+    if not scenes:
+        scenes = [{"nodes": scene_roots(document)}]
+        tree["scenes"], tree["scene"] = scenes, 0
+    flat = matrix.T.ravel().tolist()
+    for scene in scenes:
+        roots = roots_of(document, scene)
+        for root in roots:
+            if root not in above:
+                above[root] = len(nodes)
+                nodes.append({"name": "meshreg", "matrix": flat, "children": [root]})
+        if roots:  # the format allows no empty list
+            scene["nodes"] = [above[root] for root in roots]
+    return tree

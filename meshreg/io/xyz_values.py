@@ -1,0 +1,76 @@
+"""Parse the rows of a text cloud whose layout is known."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from meshreg.errors import InputError
+from meshreg.io.xyz_layout import Layout
+from meshreg.types import Float64
+
+_UNSETTLED = 65_536
+
+
+def wanted_columns(layout: Layout) -> list[int]:
+    """Return the columns to parse: those with a meaning, or the first seven where it is guessed."""
+    if layout.guessed:
+        return list(range(min(layout.columns, 7)))
+    return sorted(set(layout.where.values()))
+
+
+def read_values(data: NDArray[np.uint8], layout: Layout, path: Path) -> Float64:
+    """Parse all rows: (rows, columns of `wanted_columns`) float64, NaN where a field is no number.
+
+    Raises
+    ------
+    InputError
+        As `read`.
+    """
+    from meshreg.io.xyz_kernels import count_rows, parse_rows
+
+    rows = count_rows(data, layout.start)
+    if layout.count is not None and layout.count != rows:
+        raise InputError(
+            f"announces {layout.count} points, but holds {rows} rows.",
+            file=path,
+            place="line 1",
+            remedy="It is cut off or was edited; export it again.",
+        )
+    wanted = wanted_columns(layout)
+    slots = np.full(layout.columns, -1, np.int64)
+    slots[wanted] = np.arange(len(wanted))
+    out = np.full((rows, len(wanted)), np.nan)
+    state = np.array([layout.start, layout.line, 0], np.int64)
+    unsettled = np.zeros((_UNSETTLED + layout.columns, 5), np.int64)
+    while state[0] < len(data):
+        count, fields = parse_rows(data, state, ord(layout.delimiter), slots, out, unsettled)
+        for row, slot, start, end, line in unsettled[:count].tolist():
+            out[row, slot] = _settled(bytes(data[start:end]), line, path)
+        if fields:
+            raise InputError(
+                f"has {fields} values where the other rows have {layout.columns}.",
+                file=path,
+                place=f"line {state[1]}",
+                remedy="The row is cut off or damaged; export it again.",
+            )
+    return out
+
+
+def _settled(word: bytes, line: int, path: Path) -> float:
+    """Read a number that the kernel left to Python, or say which line has none."""
+    text = word.decode("latin-1").strip("\"'")
+    try:
+        if "_" not in text:
+            return float(text)
+    except ValueError:
+        pass
+    comma = "a decimal comma" if "," in text else "text"
+    raise InputError(
+        f"has {comma} where a number should be: {text[:40]!r}.",
+        file=path,
+        place=f"line {line}",
+        remedy="Write numbers with a decimal point, and nan where there is none.",
+    )

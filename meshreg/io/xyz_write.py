@@ -1,0 +1,153 @@
+"""WRITE text clouds: from memory, or a moved copy of a file that keeps all else."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from meshreg.errors import OutputError, UsageError
+from meshreg.io.mover import Mover
+from meshreg.io.rewriting import Extent, moved_points, require_unchanged
+from meshreg.io.safe import atomic_file, file_bytes
+from meshreg.io.sidecar import write_shift
+from meshreg.io.xyz_layout import Layout, read_layout
+from meshreg.io.xyz_values import read_values, wanted_columns
+from meshreg.types import Float64, Frame, PointCloud, SourceFile, Survey
+
+_XYZ, _NORMAL = ("x", "y", "z"), ("nx", "ny", "nz")
+_BLOCK = 1 << 22
+
+
+def write(survey: Survey, path: Path) -> tuple[Path, ...]:
+    """Write a point cloud as text in absolute coordinates, with six decimals.
+
+    CSV has commas and a header; .txt a header as a comment; .xyz blanks and no header. The CRS,
+    if any, goes into a sidecar.
+
+    Returns
+    -------
+    tuple of Path
+        The file, then its sidecar.
+
+    Raises
+    ------
+    UsageError
+        The survey is not a point cloud.
+    OutputError
+        Not written, or not what was meant when read back.
+    """
+    cloud = survey.geometry
+    if not isinstance(cloud, PointCloud):
+        raise UsageError(f"A text file holds points, not a {type(cloud).__name__}.", file=path)
+    comma = path.suffix.lower() == ".csv"
+    mark = "," if comma else " "
+    names = ["x", "y", "z", *(("red", "green", "blue") if cloud.colors is not None else ())]
+    row = mark.join(["%.6f"] * 3 + ["%d"] * (len(names) - 3))
+    extent = Extent()
+    with atomic_file(path) as temporary:
+        with open(temporary, "w", encoding="ascii", newline="\n") as stream:
+            if path.suffix.lower() != ".xyz":
+                stream.write(("" if comma else "//") + mark.join(names) + "\n")
+            for start in range(0, len(cloud.points), 100_000):
+                part: Any = cloud.points[start : start + 100_000] + survey.origin
+                extent.add(part)
+                if cloud.colors is not None:
+                    part = np.hstack([part, cloud.colors[start : start + 100_000]])
+                stream.write("\n".join([row] * len(part)) % tuple(part.ravel().tolist()) + "\n")
+        _check(temporary, path, extent, 1e-6)
+    frame = Frame(file_crs=survey.crs, crs=survey.crs)
+    return (path, *write_shift(path, frame))
+
+
+def _check(written: Path, path: Path, extent: Extent, tolerance: float) -> Layout:
+    data = file_bytes(written)
+    layout = read_layout(data, path)
+    slot = {column: number for number, column in enumerate(wanted_columns(layout))}
+    values = read_values(data, layout, path)
+    extent.require_equal(values[:, [slot[layout.where[name]] for name in _XYZ]], path, tolerance)
+    return layout
+
+
+def rewrite(source: SourceFile, move: Mover, path: Path) -> tuple[Path, ...]:
+    """Write a moved copy of a text cloud: coordinates and normals change, every other word stays.
+
+    Numbers keep at least the decimals that they had, and four (metres) or nine (degrees). A
+    column called depth goes on counting downward.
+
+    Raises
+    ------
+    InputError
+        The source is damaged or has changed since it was read.
+    OutputError
+        Not written, or not what was meant when read back.
+    """
+    from meshreg.io.crs import is_geographic
+
+    require_unchanged(source, path)
+    data = file_bytes(source.path)
+    layout = read_layout(data, source.path)
+    values = read_values(data, layout, source.path)
+    slot = {column: number for number, column in enumerate(wanted_columns(layout))}
+    points = values[:, [slot[layout.where[name]] for name in _XYZ]]
+    moved = moved_points(move, points)
+    flip = layout.down and source.frame.axes[2, 2] < 0 and move.frame.axes[2, 2] > 0
+    if flip:
+        moved[:, 2] *= -1
+    degrees = move.frame.file_crs is not None and is_geographic(move.frame.file_crs)
+    names = {}
+    if layout.lonlat and not degrees:
+        names = {rb"\blon(g|gitude)?\b": b"x", rb"\blat(itude)?\b": b"y"}
+    if layout.down and not flip and move.frame.axes[2, 2] > 0:
+        names[rb"\b(water)?[ _]?(depth|down)\b"] = b"z"  # they were negative, hence heights
+    replacing = {layout.where[name]: moved[:, k] for k, name in enumerate(_XYZ)}
+    least = dict.fromkeys(replacing, 4)
+    if degrees:
+        least |= {layout.where["x"]: 9, layout.where["y"]: 9}
+    if set(_NORMAL) <= layout.where.keys():
+        vectors = values[:, [slot[layout.where[name]] for name in _NORMAL]]
+        turned = move.directions(points, vectors)
+        if flip:
+            turned[:, 2] *= -1
+        replacing |= {layout.where[name]: turned[:, k] for k, name in enumerate(_NORMAL)}
+        least |= {layout.where[name]: 6 for name in _NORMAL}
+    extent = Extent()
+    extent.add(moved)
+    with atomic_file(path) as temporary:
+        with open(temporary, "wb") as stream:
+            stream.write(_renamed(bytes(data[: layout.start]), names))
+            stream.writelines(_moved_lines(data, layout, replacing, least))
+        again = _check(temporary, path, extent, 0.51e-4)
+    if again.columns != layout.columns or again.where != layout.where:
+        raise OutputError("does not read back with the same columns.", file=path)
+    return (path,)
+
+
+def _renamed(head: bytes, names: dict[bytes, bytes]) -> bytes:
+    """Rename columns in the header, the last line before the rows."""
+    lines = head.splitlines(keepends=True)
+    for pattern, name in names.items():
+        lines[-1] = re.sub(pattern, name, lines[-1], count=1, flags=re.IGNORECASE)
+    return b"".join(lines)
+
+
+def _moved_lines(
+    data: NDArray[np.uint8], layout: Layout, replacing: dict[int, Float64], least: dict[int, int]
+) -> Iterator[memoryview]:
+    """Give the bytes from `layout.start` on, with the numbers of some columns replaced."""
+    from meshreg.io.xyz_kernels import splice_rows
+
+    columns = np.array(sorted(replacing), np.int64)
+    numbers = np.stack([replacing[column] for column in columns], axis=1)
+    decimals = np.array([least[column] for column in columns], np.int64)
+    state = np.array([layout.start, 0], np.int64)
+    out = np.empty(_BLOCK, np.uint8)
+    while state[0] < len(data):
+        size = splice_rows(data, state, ord(layout.delimiter), columns, numbers, decimals, out)
+        if size == 0:
+            out = np.empty(2 * len(out), np.uint8)
+        yield out[:size].data

@@ -1,0 +1,127 @@
+"""How far apart a survey's points and texels are on the ground."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from meshreg.errors import InputError
+from meshreg.types import Float64, Maps, Mesh, PointCloud, Survey
+
+_SAMPLE = 200_000  # faces or points looked at; every n-th, so that the answer is repeatable
+
+
+@dataclass(frozen=True)
+class Spacing:
+    """Typical distances on the ground.
+
+    Attributes
+    ----------
+    points : float
+        Between neighbouring vertices, points or height cells [m].
+    texels : float or None
+        Between neighbouring texels [m]; None without a texture or an orthomosaic.
+    """
+
+    points: float
+    texels: float | None
+
+
+def measure_spacing(survey: Survey) -> Spacing:
+    """Measure how far apart the survey's points and texels are, seen from above.
+
+    A mesh: the median edge, and the median over the ground of the square root of ground area per
+    texel. A cloud: the square root of occupied area per point. Maps: their cells. At most 200,000
+    faces or points are looked at (every n-th).
+
+    Raises
+    ------
+    InputError
+        If the survey covers no ground: no faces, or all points in one place or on one line.
+    """
+    geometry = survey.geometry
+    if isinstance(geometry, Maps):
+        texels = None if geometry.color_grid is None else geometry.color_grid.cell
+        return Spacing(geometry.height_grid.cell, texels)
+    if isinstance(geometry, PointCloud):
+        points = _cloud_spacing(geometry.points)
+        texels = None
+    else:
+        points = _edge(geometry)
+        texels = median_texel(*texel_sizes(geometry)[1:])
+    if points is None:
+        raise InputError(
+            f"{survey.name} covers no ground: its points lie in one place or on one line.",
+            file=survey.source[0].path if survey.source else None,
+            remedy="Check the file, or which axis points up (--up, --axes).",
+        )
+    return Spacing(points, texels)
+
+
+def _edge(mesh: Mesh) -> float | None:
+    faces = mesh.faces[:: max(1, len(mesh.faces) // _SAMPLE)]
+    corners = mesh.vertices[faces][:, :, :2]
+    edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
+    edges = edges[np.isfinite(edges) & (edges > 0)]
+    return float(np.median(edges)) if edges.size else None
+
+
+def texel_sizes(mesh: Mesh) -> tuple[Float64, Float64, Float64]:
+    """Look at a sample of the textured faces.
+
+    Returns
+    -------
+    page : (n,) float64
+        Index of the face's texture page.
+    texel : (n,) float64
+        Side of a texel on the ground, seen from above [m].
+    area : (n,) float64
+        Ground that the face covers [m²]: its weight.
+    """
+    if mesh.uv is None or mesh.face_texture is None:
+        return np.empty(0), np.empty(0), np.empty(0)
+    step = max(1, len(mesh.faces) // _SAMPLE)
+    faces, uv, page = mesh.faces[::step], mesh.uv[::step], mesh.face_texture[::step]
+    faces, uv, page = faces[page >= 0], uv[page >= 0].astype(np.float64), page[page >= 0]
+    pixels = np.array([texture.size for texture in mesh.textures], float).reshape(-1, 2)
+    ground = _area(mesh.vertices[faces][:, :, :2])
+    texels = _area(uv) * pixels[page].prod(axis=1)
+    # A face that no camera saw often has all corners on one texel: it tells nothing.
+    told = np.isfinite(ground * texels) & (ground > 0) & (texels > 1e-3)
+    texel = np.sqrt(ground[told] / texels[told])
+    return page[told].astype(np.float64), texel, ground[told]
+
+
+def median_texel(texel: Float64, area: Float64) -> float | None:
+    """Return the texel [m] that half the ground lies below; None without any."""
+    if not texel.size:
+        return None
+    order = np.argsort(texel, kind="stable")
+    total = np.cumsum(area[order])
+    return float(texel[order][np.searchsorted(total, 0.5 * total[-1])])
+
+
+def _area(corners: Float64) -> Float64:
+    a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    return np.asarray(0.5 * np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]))
+
+
+def _cloud_spacing(points: Float64) -> float | None:
+    """Square root of occupied ground per point, the ground counted in squares of 25 points."""
+    sample = points[:: max(1, len(points) // _SAMPLE), :2]
+    sample = sample[np.isfinite(sample).all(axis=1)]
+    if not len(sample):
+        return None
+    places = sample - sample.min(axis=0)
+    extent = places.max(axis=0)
+    square = 5.0 * np.sqrt(extent.prod() / len(sample))
+    if not square > 0:
+        return None
+    area = 0.0
+    for _ in range(3):  # holes shrink the ground, and with it the squares
+        cols = int(extent[0] / square) + 1
+        cells = np.floor(places / square).astype(np.int64)
+        area = len(np.unique(cells[:, 1] * cols + cells[:, 0])) * square**2
+        square = 5.0 * np.sqrt(area / len(sample))
+    return float(np.sqrt(area / len(points)))

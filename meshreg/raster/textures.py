@@ -1,0 +1,130 @@
+"""Texture pages: decoded group by group, and averaged where their texels are finer than samples."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from meshreg.errors import InputError
+from meshreg.raster.spacing import median_texel, texel_sizes
+from meshreg.types import Int32, Mesh, Texture, UInt8
+
+if TYPE_CHECKING:
+    from meshreg.raster.shade_kernels import Pages
+
+log = logging.getLogger("meshreg")
+_GROUP_BYTES = 1 << 30  # decoded pages that are in memory together
+
+
+@dataclass(frozen=True)
+class PagePlan:
+    """How one texture page will be kept: `times` × `times` texels averaged to one, or as it is."""
+
+    index: int
+    texture: Texture
+    times: int
+    wraps: bool
+
+    @property
+    def stored(self) -> tuple[int, int]:
+        """(width, height) in memory."""
+        width, height = self.texture.size
+        return -(-width // self.times), -(-height // self.times)
+
+
+def plan_pages(mesh: Mesh, used: Int32, sample: float) -> list[list[PagePlan]]:
+    """Decide how to keep the pages `used`, and which are in memory together.
+
+    A page whose texels are finer than the distance `sample` [m] between samples is averaged over
+    blocks of texels as wide as that; else bilinear samples would skip texels, and alias.
+    """
+    from meshreg.raster.shade_kernels import page_spans
+
+    assert mesh.uv is not None
+    assert mesh.face_texture is not None
+    page, texel, area = texel_sizes(mesh)
+    spans = page_spans(mesh.uv, mesh.face_texture, len(mesh.textures))
+    groups: list[list[PagePlan]] = []
+    free = 0
+    for index in used:
+        texture, mine = mesh.textures[index], page == index
+        size = median_texel(texel[mine], area[mine])
+        times = 1 if size is None else max(1, round(sample / size))
+        low, high = spans[index]
+        wraps = not texture.clamp and bool((low < -1e-4).any() or (high > 1 + 1e-4).any())
+        while wraps and any(length % times for length in texture.size):
+            times -= 1  # blocks must fit the period
+        plan = PagePlan(int(index), texture, times, wraps)
+        need = 3 * plan.stored[0] * plan.stored[1]
+        if not groups or need > free:
+            groups.append([])
+            free = _GROUP_BYTES
+        groups[-1].append(plan)
+        free -= need
+    return groups
+
+
+def load_pages(mesh: Mesh, group: list[PagePlan]) -> tuple[Pages, list[int]]:
+    """Decode a group of pages; also return the pages that could not be, which stay uncolored."""
+    from meshreg.raster.shade_kernels import Pages
+
+    sizes = [plan.stored[0] * plan.stored[1] for plan in group]
+    table = np.full((len(mesh.textures), 6), -1.0)
+    pixels = np.empty(3 * sum(sizes), np.uint8)
+    seen = np.empty(0, np.uint8)
+    missing, offset = [], 0
+    for plan, size in zip(group, sizes, strict=True):
+        try:
+            image, alpha = _decoded(plan.texture)
+        except InputError as error:
+            log.warning("Texture page %s is left out: %s", plan.texture.name, error)
+            missing.append(plan.index)
+            continue
+        if plan.times > 1:
+            image, alpha = _averaged(mesh, plan, image, alpha)
+        pixels[3 * offset : 3 * (offset + size)] = image.ravel()
+        if alpha is not None:
+            if not seen.size:
+                seen = np.ones(sum(sizes), np.uint8)
+            seen[offset : offset + size] = alpha.ravel()
+        width, height = plan.texture.size
+        scale = width / plan.times, height / plan.times
+        table[plan.index] = (offset, *plan.stored, plan.wraps, *scale)
+        offset += size
+    return Pages(table, pixels, seen), missing
+
+
+def _decoded(texture: Texture) -> tuple[UInt8, UInt8 | None]:
+    """Load a page: its colors, and 1 where alpha is 128 or more (None without alpha)."""
+    image = texture.load()
+    width, height = texture.size
+    if image.dtype != np.uint8 or image.shape not in ((height, width, 3), (height, width, 4)):
+        raise InputError(
+            f"The page decodes to {image.dtype} of shape {image.shape}; its header promises "
+            f"{width} × {height} pixels of three or four bytes.",
+            file=texture.name,
+            remedy="Export the texture again.",
+        )
+    if image.shape[2] == 3:
+        return image, None
+    return np.ascontiguousarray(image[:, :, :3]), (image[:, :, 3] >= 128).astype(np.uint8)
+
+
+def _averaged(mesh: Mesh, plan: PagePlan, image: UInt8, alpha: UInt8 | None) -> tuple[UInt8, UInt8]:
+    """Average blocks of texels, over those that the mesh uses.
+
+    Without that a block at the edge of an atlas chart would take in the filling beside it.
+    """
+    from meshreg.raster.shade_kernels import covered, shrunk
+
+    assert mesh.uv is not None
+    assert mesh.face_texture is not None
+    if plan.wraps:
+        used = np.ones(image.shape[:2], np.uint8)
+    else:
+        used = covered(mesh.uv, mesh.face_texture, plan.index, image.shape[0], image.shape[1])
+    seen = used if alpha is None else used * alpha
+    return shrunk(np.ascontiguousarray(image), used, seen, plan.times)

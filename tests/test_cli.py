@@ -1,0 +1,680 @@
+"""The command line: exit codes, what is said and where, what is left on the disk."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import json
+import logging
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import numpy as np
+import pytest
+from made_registration import made_registration
+from rich.console import Console
+
+import meshreg
+import meshreg.pipeline
+from meshreg import cli
+from meshreg.cli_parts import common, console, info, machine
+from meshreg.cli_parts.options import for_both, join_settings, read_options
+from meshreg.doctor import Check, run_probe
+from meshreg.errors import InputError, UsageError
+from meshreg.settings import Settings
+from meshreg.types import Grid, Maps, Mesh, PointCloud, Survey, Transform
+
+ROOT = Path(__file__).parent.parent
+SCHEMA = json.loads((Path(meshreg.__file__).parent / "io/registration.schema.json").read_text())
+Run = Callable[..., tuple[int, str, str]]
+
+
+def write_obj(path: Path, seed: int = 0) -> Path:
+    """A small bumpy OBJ, 8 × 8 vertices half a metre apart."""
+    rng = np.random.default_rng(seed)
+    rows = [
+        f"v {0.5 * i:.3f} {0.5 * j:.3f} {rng.uniform(-0.1, 0.1):.4f}"
+        for j in range(8)
+        for i in range(8)
+    ]
+    for j in range(7):
+        for i in range(7):
+            a = 8 * j + i + 1
+            rows += [f"f {a} {a + 1} {a + 9}", f"f {a} {a + 9} {a + 8}"]
+    path.write_text("\n".join(rows) + "\n")
+    return path
+
+
+@pytest.fixture
+def pair(tmp_path: Path) -> tuple[str, str]:
+    folder = tmp_path / "in"
+    folder.mkdir()
+    return str(write_obj(folder / "old.obj", 1)), str(write_obj(folder / "new.obj", 2))
+
+
+@pytest.fixture
+def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Run:
+    monkeypatch.setenv("COLUMNS", "200")
+
+    def call(*arguments: object) -> tuple[int, str, str]:
+        code = cli.run([str(argument) for argument in arguments])
+        said = capsys.readouterr()
+        return code, said.out, said.err
+
+    return call
+
+
+@pytest.fixture
+def verdict(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], dict[str, Any]]:
+    """Replace the registration itself by a made one; return what the command line asked of it."""
+
+    def decide(name: str) -> dict[str, Any]:
+        asked: dict[str, Any] = {}
+
+        def register_pair(
+            reference: Survey, moving: Survey, settings: Settings, **rest: Any
+        ) -> Any:
+            asked.update(reference=reference, moving=moving, settings=settings, **rest)
+            for stage in ("rasterize", "sift", "judge"):
+                rest["progress"](stage, 0.0)
+                rest["progress"](stage, 1.0)
+            logging.getLogger("meshreg").warning("a [bold]loud[/bold] word")
+            return dataclasses.replace(made_registration(name), settings=settings.as_dict())
+
+        monkeypatch.setattr(meshreg.pipeline, "register_pair", register_pair)
+        return asked
+
+    # Figures have their own tests; here only that they are asked for.
+    monkeypatch.setattr(
+        "meshreg.report.draw_figures",
+        lambda registration, folder: Path(folder).mkdir() or (),
+    )
+    return decide
+
+
+# ---- register ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("name", "code"), [("accepted", 0), ("review", 4), ("rejected", 4)])
+def test_register_tells_the_verdict_by_its_exit_code(
+    tmp_path: Path, pair: tuple[str, str], run: Run, verdict: Any, name: str, code: int
+) -> None:
+    verdict(name)
+    out = tmp_path / "deep" / "out"
+    got, said, error = run("register", *pair, "-o", out)
+    assert got == code
+    assert name.upper() in said
+    assert made_registration(name).reason in said
+    assert str(out) in said
+    names = {path.name for path in out.iterdir()}
+    assert {"registration.json", "settings.toml", "log.txt", "figures"} <= names
+    assert ("new_registered.obj" in names) == (name != "rejected")
+    assert ("next:" in said) == (code == 4)
+    # Plain lines, one a stage, when nobody watches; markup in a message is not interpreted.
+    lines = error.splitlines()
+    assert [line for line in lines if line == "rasterizing"] == ["rasterizing"]
+    assert lines.index("reading") < lines.index("rasterizing") < lines.index("writing")
+    assert "warning: a [bold]loud[/bold] word" in lines
+    log = (out / "log.txt").read_text()
+    assert "a [bold]loud[/bold] word" in log
+    assert f"{name}: " in log
+    assert sorted(path.name for path in out.parent.iterdir()) == ["out"]  # no lock, no leftovers
+
+
+def test_json_is_the_record_and_nothing_else(
+    tmp_path: Path, pair: tuple[str, str], run: Run, verdict: Any
+) -> None:
+    verdict("accepted")
+    code, said, error = run("register", *pair, "-o", tmp_path / "out", "--json")
+    assert (code, error) == (0, "")
+    document = json.loads(said)
+    jsonschema.validate(document, SCHEMA)
+    assert said == (tmp_path / "out" / "registration.json").read_text()
+    assert document["seconds"]["read"] > 0
+
+
+def test_options_reach_the_registration(
+    tmp_path: Path, pair: tuple[str, str], run: Run, verdict: Any
+) -> None:
+    asked = verdict("accepted")
+    config = tmp_path / "c.toml"
+    config.write_text("seed = 3\n[sift]\nratio = 0.7\n[search]\nradius = 4.0\n")
+    code, _, error = run(
+        "register", *pair, "-o", tmp_path / "out",
+        "--reference-shift", "731000,5705000,-1.5", "--moving-shift", "-13.4,8.7,-1.25",
+        "--axes", "ned", "--unit", "cm", "--search-radius", 30, "--dem-cell", 0.2,
+        "--methods", "terrain,sift", "--config", config, "--set", "judge.min_overlap=0.4",
+        "--set", "sift.sample=7",
+    )  # fmt: skip
+    assert code == 0, error
+    settings: Settings = asked["settings"]
+    assert settings.search.radius == 30.0  # an option beats the file
+    assert settings.sift.ratio == 0.7
+    assert settings.sift.sample == 7
+    assert settings.seed == 3
+    assert settings.judge.min_overlap == 0.4
+    assert settings.raster.dem_cell == 0.2
+    assert settings.methods == ("terrain", "sift")
+    # north, east, down in centimetres, then the shift: written out for the first vertices
+    for name, shift in (("reference", [731000, 5705000, -1.5]), ("moving", [-13.4, 8.7, -1.25])):
+        survey: Survey = asked[name]
+        assert isinstance(survey.geometry, Mesh)
+        path = Path(pair[0 if name == "reference" else 1])
+        x, y, z = (float(word) for word in path.read_text().splitlines()[9].split()[1:])
+        expected = np.array([y, x, -z]) / 100 + shift
+        np.testing.assert_allclose(survey.geometry.vertices[9] + survey.origin, expected, atol=1e-9)
+    assert (tmp_path / "out" / "settings.toml").read_text().count("radius = 30.0") == 1
+
+
+def test_masks_go_to_the_survey_that_they_name(tmp_path: Path) -> None:
+    square = {
+        "type": "Feature", "properties": {},
+        "geometry": {"type": "Polygon", "coordinates": [[[0, 0], [2, 0], [2, 2], [0, 2], [0, 0]]]},
+    }  # fmt: skip
+    path = tmp_path / "a.geojson"
+    # Coordinates beyond degrees are the local frame's own metres.
+    far = json.loads(
+        json.dumps(square).replace("[2, 2]", "[2, 1000]").replace("[0, 2]", "[0, 1000]")
+    )
+    path.write_text(json.dumps({"type": "FeatureCollection", "features": [far]}))
+    grid = Grid(-1.0, 3.0, 1.0, (4, 4))
+    inside = np.zeros((4, 4), bool)
+    inside[0:3, 1:3] = True
+    plain = common.read_masks([str(path)], None)
+    assert plain["moving"] is None
+    assert plain["reference"] is not None
+    np.testing.assert_array_equal(plain["reference"](grid), inside)
+    other = common.read_masks([f"moving:not:{path}"], None)
+    assert other["reference"] is None
+    assert other["moving"] is not None
+    np.testing.assert_array_equal(other["moving"](grid), ~inside)
+    both = common.read_masks([str(path), f"not:{path}"], None)
+    assert both["reference"] is not None
+    assert not both["reference"](grid).any()
+    with pytest.raises(InputError):
+        common.read_masks([str(tmp_path / "none.geojson")], None)
+
+
+def test_same_file_twice_is_said(
+    tmp_path: Path, pair: tuple[str, str], run: Run, verdict: Any
+) -> None:
+    verdict("accepted")
+    code, said, error = run("register", pair[0], pair[0], "-o", tmp_path / "out")
+    assert code == 0
+    assert "same file" in error
+    assert "same file" in said
+    notes = json.loads((tmp_path / "out" / "registration.json").read_text())["notes"]
+    assert any("same file" in note for note in notes)
+
+
+def test_names_with_markup_are_shown_as_they_are(tmp_path: Path, run: Run, verdict: Any) -> None:
+    verdict("accepted")
+    folder = tmp_path / "[bold]"
+    folder.mkdir()
+    (folder / "a[").mkdir()
+    old, new = write_obj(folder / "[red]x.obj", 1), write_obj(folder / "a[" / "b].obj", 2)
+    out = folder / "[green]out"
+    code, said, error = run("register", old, new, "-o", out)
+    assert code == 0, error
+    assert "[green]out" in said
+    assert "b]_registered.obj" in said
+    code, _, error = run("register", folder / "a[" / "i]none.obj", new, "-o", folder / "o2")
+    assert code == 3
+    assert "a[/i]none.obj" in error
+
+
+def test_existing_output_is_refused_then_replaced(
+    tmp_path: Path, pair: tuple[str, str], run: Run, verdict: Any
+) -> None:
+    asked = verdict("accepted")
+    out = tmp_path / "out"
+    assert run("register", *pair, "-o", out)[0] == 0
+    before = (out / "registration.json").read_bytes()
+    asked.clear()
+    code, _, error = run("register", *pair, "-o", out)
+    assert code == 2
+    assert "--overwrite" in error
+    assert not asked  # refused before any work
+    assert (out / "registration.json").read_bytes() == before
+    verdict("rejected")
+    assert run("register", *pair, "-o", out, "--overwrite")[0] == 4
+    assert not (out / "new_registered.obj").exists()
+
+
+def test_a_folder_of_somebody_elses_is_never_replaced(
+    tmp_path: Path, pair: tuple[str, str], run: Run, verdict: Any
+) -> None:
+    verdict("accepted")
+    precious = tmp_path / "out" / "thesis.txt"
+    precious.parent.mkdir()
+    precious.write_text("mine")
+    assert run("register", *pair, "-o", precious.parent, "--overwrite")[0] == 2
+    assert precious.read_text() == "mine"
+
+
+def test_input_that_changes_meanwhile_gives_no_output(
+    tmp_path: Path, pair: tuple[str, str], run: Run, verdict: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def register_pair(*surveys: Any, **rest: Any) -> Any:
+        write_obj(Path(pair[1]), 77)
+        return made_registration()
+
+    verdict("accepted")
+    monkeypatch.setattr(meshreg.pipeline, "register_pair", register_pair)
+    code, _, error = run("register", *pair, "-o", tmp_path / "out")
+    assert code == 3
+    assert "new.obj" in error
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["in"]
+
+
+@pytest.mark.parametrize(
+    ("raised", "code", "words"),
+    [
+        (MemoryError("12 GB"), 5, ("memory", "12 GB", "--dem-cell")),
+        (RuntimeError("odd"), 1, ("RuntimeError: odd", "bug", "--debug")),
+        (OSError(28, "No space left on device"), 6, ("No space left",)),
+        (InputError("is odd.", file="x.obj", place="line 3", remedy="Mend it."), 3,
+         ("x.obj, line 3: is odd.", "Mend it.")),
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("flags", [(), ("--json",), ("--debug",)])
+def test_what_goes_wrong_is_one_message_and_no_output(
+    tmp_path: Path, pair: tuple[str, str], run: Run, verdict: Any, monkeypatch: pytest.MonkeyPatch,
+    raised: BaseException, code: int, words: tuple[str, ...], flags: tuple[str, ...],
+) -> None:  # fmt: skip
+    def register_pair(*surveys: Any, **rest: Any) -> Any:
+        raise raised
+
+    verdict("accepted")
+    monkeypatch.setattr(meshreg.pipeline, "register_pair", register_pair)
+    got, said, error = run("register", *pair, "-o", tmp_path / "out", *flags)
+    assert got == code
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["in"]
+    assert ("Traceback" in error) == ("--debug" in flags)
+    if "--json" in flags:
+        assert error == ""
+        found = json.loads(said)
+        assert found["schema"] == "meshreg.error/1"
+        assert found["error"]["code"] == code
+        assert set(found["error"]) == {"code", "kind", "file", "place", "cause", "remedy"}
+        text = f"{found['error']['file']}, {found['error']['place']}: {found['error']['cause']} "
+        text += str(found["error"]["remedy"])
+    else:
+        assert said == ""
+        text = error
+    for word in words:
+        assert word in text
+
+
+def test_keyboard_interrupt_outside_the_job(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted() -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("meshreg.doctor.examine", interrupted)
+    code, said, error = run("doctor", "--debug")
+    assert (code, said) == (130, "")
+    assert error.strip() == "Stopped; nothing was written."
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("register", "a.obj"), "Missing argument"),
+        (("register", "a", "b"), "--out"),
+        (("register", "a", "b", "-o", "c", "--no-such"), "no-such"),
+        (("register", "a", "b", "-o", "c", "--axes", "xyz"), "enu"),
+        (("register", "a", "b", "-o", "c", "--moving-shift", "1,2"), "three numbers"),
+        (("register", "a", "b", "-o", "c", "--set", "sift.sample"), "="),
+        (("register", "a", "b", "-o", "c", "--set", "sift.nothing=3"), "sift.nothing"),
+        (("register", "a", "b", "-o", "c", "--set", "sift.sample=many"), "sift.sample"),
+        (("register", "a", "b", "-o", "c", "--config", "none.toml"), "none.toml"),
+        (("register", "a", "b", "-o", "c", "--scale", "1", "--scale", "2", "--scale", "3"), "3"),
+        (("frobnicate",), "frobnicate"),
+    ],
+)
+@pytest.mark.parametrize("as_json", [False, True])
+def test_usage_errors(run: Run, arguments: tuple[str, ...], words: str, as_json: bool) -> None:
+    code, said, error = run(*arguments, *(["--json"] if as_json else []))
+    assert code == 2
+    if as_json:
+        assert error == ""
+        assert json.loads(said)["error"]["code"] == 2
+        assert words in json.loads(said)["error"]["cause"] + said
+    else:
+        assert said == ""
+        assert words in error
+        assert "Traceback" not in error
+
+
+@pytest.mark.parametrize("flags", [(), ("--json",)])
+def test_missing_input_is_bad_input(
+    tmp_path: Path, pair: tuple[str, str], run: Run, flags: tuple[str, ...]
+) -> None:
+    code, said, error = run("register", tmp_path / "no.obj", pair[1], "-o", tmp_path / "o", *flags)
+    assert code == 3
+    assert "no.obj" in said + error
+    assert not (tmp_path / "o").exists()
+
+
+def test_full_disk_is_found_before_the_work(
+    tmp_path: Path, pair: tuple[str, str], run: Run, verdict: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = verdict("accepted")
+    usage = type("Usage", (), {"free": 3_000_000})
+    monkeypatch.setattr("shutil.disk_usage", lambda folder: usage)
+    code, _, error = run("register", *pair, "-o", tmp_path / "out")
+    assert code == 6
+    assert "3 MB free" in error
+    assert not asked
+
+
+def test_output_that_cannot_be_written_is_found_before_the_work(
+    pair: tuple[str, str], run: Run, verdict: Any
+) -> None:
+    asked = verdict("accepted")
+    for out in ("/proc/meshreg/out", pair[0] + "/out"):
+        code, _, error = run("register", *pair, "-o", out)
+        assert code == 6
+        assert "cannot be written" in error
+    assert not asked
+
+
+def test_help_version_and_no_arguments(run: Run) -> None:
+    code, said, _ = run("--help")
+    assert code == 0
+    for command in ("register", "rasterize", "apply", "info", "doctor", "demo"):
+        assert command in said
+        assert run(command, "--help")[0] == 0
+    assert run("--version")[1].strip() == f"meshreg {meshreg.__version__}"
+    assert run()[0] == 2
+
+
+# ---- stopping ---------------------------------------------------------------------------------
+
+BUSY = """
+import sys, ctypes, time
+import meshreg.pipeline
+def register_pair(*surveys, **rest):
+    print("working", flush=True)
+    if {native}:
+        ctypes.CDLL(None).sleep(60)  # a native call: Python hears of signals only after it
+    else:
+        while True:
+            time.sleep(0.01)
+meshreg.pipeline.register_pair = register_pair
+from meshreg.cli import run
+sys.exit(run(sys.argv[1:]))
+"""
+
+
+@pytest.mark.parametrize("native", [False, True])
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_signals_stop_the_job_and_leave_nothing(
+    tmp_path: Path, pair: tuple[str, str], native: bool, number: int, code: int
+) -> None:
+    out = tmp_path / "out"
+    command = [sys.executable, "-c", BUSY.format(native=native), "register", *pair, "-o", str(out)]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT
+    ) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "working\n"
+        assert any(path.name.startswith(".out") for path in tmp_path.iterdir())
+        time.sleep(0.2)
+        process.send_signal(number)
+        _, error = process.communicate(timeout=30)  # a native call would last 60
+    assert process.returncode == code, error
+    assert "Stopped" in error
+    assert "Traceback" not in error
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["in"]
+
+
+def test_second_signal_ends_at_once(tmp_path: Path, pair: tuple[str, str]) -> None:
+    command = [
+        sys.executable, "-c", BUSY.format(native=True), "register", *pair,
+        "-o", str(tmp_path / "out"),
+    ]  # fmt: skip
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT
+    ) as process:
+        assert process.stdout is not None
+        process.stdout.readline()
+        for _ in range(2):
+            process.send_signal(signal.SIGINT)
+            time.sleep(0.3)
+        process.communicate(timeout=30)
+    assert process.returncode == 130
+
+
+def test_reader_that_goes_away_is_no_error(tmp_path: Path, pair: tuple[str, str]) -> None:
+    code = f"{sys.executable} -m meshreg info {pair[0]} | head -c 1"
+    done = subprocess.run(code, shell=True, capture_output=True, text=True, cwd=ROOT, check=False)
+    assert "Traceback" not in done.stderr
+    assert "Exception" not in done.stderr
+
+
+# ---- the other commands -----------------------------------------------------------------------
+
+
+def test_rasterize_writes_a_dem(tmp_path: Path, pair: tuple[str, str], run: Run) -> None:
+    import rasterio
+
+    out = tmp_path / "maps"
+    code, said, error = run("rasterize", pair[0], "-o", out, "--dem-cell", 0.25, "--json")
+    assert code == 0, error
+    document = json.loads(said)
+    assert set(document["maps"]) == {"dem"}  # the mesh has no colour
+    assert document["maps"]["dem"]["cell"] == 0.25
+    with rasterio.open(out / "dem.tif") as file:
+        assert file.res == (0.25, 0.25)
+        height = file.read(1, masked=True)
+        rows = [
+            line.split()[3] for line in Path(pair[0]).read_text().splitlines() if line[0] == "v"
+        ]
+        z = np.array(rows, float)
+        assert z.min() <= height.min() <= height.max() <= z.max()
+        assert height.count() * 0.0625 == pytest.approx(3.5**2, rel=0.2)
+    code, said, _ = run("rasterize", pair[0], "-o", out)
+    assert code == 2
+    assert run("rasterize", pair[0], "-o", out, "--overwrite")[0] == 0
+
+
+def test_apply_moves_a_further_file(
+    tmp_path: Path, pair: tuple[str, str], run: Run, verdict: Any
+) -> None:
+    verdict("accepted")
+    out = tmp_path / "out"
+    assert run("register", *pair, "-o", out)[0] == 0
+    cloud = tmp_path / "in" / "more.xyz"
+    points = np.random.default_rng(4).uniform(0, 3, (50, 3)).round(3)
+    cloud.write_text("\n".join(" ".join(f"{v:.3f}" for v in row) for row in points) + "\n")
+    code, said, error = run("apply", out, cloud, "-o", tmp_path / "moved", "--json")
+    assert code == 0, error
+    document = json.loads(said)
+    assert document["verdict"] == "accepted"
+    assert all(Path(name).is_file() for name in document["files"])
+    moved = np.loadtxt(tmp_path / "moved" / "more_registered.xyz")
+    transform = made_registration().transform
+    assert isinstance(transform, Transform)
+    np.testing.assert_allclose(moved[:, :3], transform.apply(points), atol=2e-3)
+
+
+def test_apply_refuses_a_rejected_registration(
+    tmp_path: Path, pair: tuple[str, str], run: Run, verdict: Any
+) -> None:
+    verdict("rejected")
+    out = tmp_path / "out"
+    run("register", *pair, "-o", out)
+    code, _, error = run("apply", out / "registration.json", pair[1], "-o", tmp_path / "moved")
+    assert code == 2
+    assert "rejected" in error
+    assert not (tmp_path / "moved").exists()
+
+
+def test_apply_warns_of_a_review(
+    tmp_path: Path, pair: tuple[str, str], run: Run, verdict: Any
+) -> None:
+    verdict("review")
+    run("register", *pair, "-o", tmp_path / "out")
+    code, _, error = run("apply", tmp_path / "out", pair[1], "-o", tmp_path / "moved")
+    assert code == 0
+    assert "review" in error
+
+
+def test_info_says_what_is_there(pair: tuple[str, str], run: Run) -> None:
+    code, said, error = run("info", pair[0], "--json")
+    assert (code, error) == (0, "")
+    document = json.loads(said)
+    assert document["kind"] == "mesh"
+    assert document["counts"] == {"vertices": 64, "faces": 98, "texture pages": 0}
+    assert document["bounds"]["low"][:2] == [0.0, 0.0]
+    assert document["size"][:2] == [3.5, 3.5]
+    assert 0.5 <= document["spacing"]["edges"] < 0.6
+    assert document["up"]["level"] is True
+    code, said, _ = run("info", pair[0])
+    for words in ("64 vertices, 98 faces", "none stated", "level", "edges 0.5"):
+        assert words in said
+
+
+def tilted(angle: float, axis: str = "x") -> Survey:
+    """A rough square of ground, turned about an axis."""
+    rng = np.random.default_rng(8)
+    points = np.column_stack([rng.uniform(-5, 5, (4000, 2)), rng.normal(0, 0.05, 4000)])
+    points[:20, 2] += 300  # floaters
+    c, s = np.cos(np.radians(angle)), np.sin(np.radians(angle))
+    turn = np.array([[1, 0, 0], [0, c, -s], [0, s, c]]) if axis == "x" else np.eye(3)
+    return Survey("made", PointCloud(points @ turn.T))
+
+
+@pytest.mark.parametrize("angle", [0.0, 4.0, 25.0, 88.0])
+def test_info_measures_the_tilt(angle: float) -> None:
+    document = info.describe(tilted(angle))
+    assert document["up"]["tilt_degrees"] == pytest.approx(angle, abs=0.3)
+    assert document["up"]["level"] == (angle < 10)
+    assert document["up"]["guess"] == ("y" if angle > 45 else "z")
+    said = " ".join(document["notes"])
+    assert ("Not level" in said) == (angle > 10)
+    assert ("--up y" in said) == (angle > 45)
+    if angle == 0:  # 4000 points on 100 m²
+        assert document["spacing"]["points"] == pytest.approx(np.sqrt(100 / 4000), rel=0.1)
+
+
+def test_info_measures_texels() -> None:
+    from meshreg.types import Texture
+
+    corners = np.array([[0.0, 0, 0], [10, 0, 0], [0, 10, 0], [10, 10, 0]])
+    faces = np.array([[0, 1, 2], [1, 3, 2]])
+    uv = np.array([[0.0, 0], [1, 0], [0, 1], [1, 1]])[faces]
+    page = Texture("page.jpg", (1000, 1000), lambda: np.zeros((1000, 1000, 3), np.uint8))
+    mesh = Mesh(corners, faces, uv=uv, face_texture=np.zeros(2), textures=(page,))
+    document = info.describe(Survey("made", mesh))
+    assert document["spacing"]["texels"] == pytest.approx(0.01, rel=1e-6)
+    assert document["textures"] == [{"name": "page.jpg", "width": 1000, "height": 1000, "faces": 2}]
+
+
+def test_info_of_maps_and_of_projected_numbers_without_crs() -> None:
+    grid = Grid(500_000.0, 6_000_000.0, 0.5, (4, 6))
+    document = info.describe(Survey("made", Maps(np.zeros((4, 6)), grid)))
+    assert document["spacing"] == {"height cell": 0.5, "colour cell": None}
+    assert document["counts"] == {"cells with height": 24}
+    assert any("no CRS" in note for note in document["notes"])
+
+
+# ---- doctor -----------------------------------------------------------------------------------
+
+
+def test_probe_tells_success_failure_and_death() -> None:
+    assert run_probe("print('one'); print('two')") == (True, "two")
+    found, said = run_probe("import no_such_module_at_all")
+    assert not found
+    assert "no_such_module_at_all" in said
+    found, said = run_probe("import os; os.kill(os.getpid(), 11)")
+    assert (found, said) == (False, "killed by signal 11")
+    found, said = run_probe("import time; time.sleep(60)", seconds=0.5)
+    assert not found
+    assert "no answer" in said
+
+
+def test_doctor_prints_the_command_that_helps(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    checks = (
+        Check("Python", "ok", "everything", "3.11.2"),
+        Check("libGL.so.1", "optional", "3-D pictures", "not [found]", "apt-get install libgl1"),
+    )
+    monkeypatch.setattr("meshreg.doctor.examine", lambda: checks)
+    code, said, _ = run("doctor")
+    assert code == 0
+    assert "not [found]" in said
+    assert "  apt-get install libgl1" in said.splitlines()
+    assert "runs without them" in said
+    missing = (*checks, Check("PROJ", "missing", "CRS", "broken", "unset PROJ_DATA"))
+    monkeypatch.setattr("meshreg.doctor.examine", lambda: missing)
+    code, said, _ = run("doctor", "--json")
+    assert code == 5
+    assert json.loads(said)["checks"][2]["remedy"] == "unset PROJ_DATA"
+    assert machine.document(checks)["schema"] == "meshreg.doctor/1"
+
+
+def test_doctor_examines_this_machine(run: Run) -> None:
+    code, said, _ = run("doctor", "--json")
+    checks = {check["name"]: check for check in json.loads(said)["checks"]}
+    assert code == 0
+    for name in ("Python", "numba", "SIFT", "PROJ", "GeoTIFF", "LAZ", "COLMAP"):
+        assert checks[name]["state"] == "ok", checks[name]
+    for check in checks.values():
+        assert check["state"] == "ok" or check["remedy"]
+
+
+def test_doctor_sees_a_wrong_proj_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from meshreg import doctor
+
+    monkeypatch.setenv("PROJ_DATA", str(tmp_path))
+    monkeypatch.setenv("PROJ_LIB", str(tmp_path))
+    checks = {check.name: check for check in doctor.examine()}
+    # meshreg ignores such a setting for itself, so it is not fatal; but it is said.
+    assert checks["PROJ"].state == "optional"
+    assert "PROJ_DATA" in checks["PROJ"].detail
+    assert checks["PROJ"].remedy == "unset PROJ_DATA PROJ_LIB"
+
+
+# ---- settings and words -----------------------------------------------------------------------
+
+
+def test_settings_are_joined_in_order(tmp_path: Path) -> None:
+    config = tmp_path / "c.toml"
+    config.write_text('preset = "paper"\n[terrain]\nhigh_pass = [1.0]\n')
+    settings = join_settings(None, config, ["terrain.high_pass=[3, 4]"], {"seed": 5})
+    paper = Settings.from_preset("paper")
+    assert settings.sift == paper.sift
+    assert settings.terrain.high_pass == (3.0, 4.0)
+    assert settings.seed == 5
+    assert join_settings("paper", None, None, {}) == paper
+    assert join_settings("paper", config, None, {}).preset == "paper"
+    with pytest.raises(UsageError, match="robust"):
+        join_settings("robust", config, None, {})
+
+
+def test_values_for_one_or_both() -> None:
+    assert for_both("--scale", None) == (None, None)
+    assert for_both("--scale", [2.0]) == (2.0, 2.0)
+    assert for_both("--scale", [2.0, 3.0]) == (2.0, 3.0)
+    assert read_options(None, "--shift").shift is None
+    assert read_options("-1.5,2e3, 0", "--shift").shift == (-1.5, 2000.0, 0.0)
+    assert type(read_options(None, "--shift", axes=cli.Axes.ned).axes) is str
+
+
+def test_bars_on_a_terminal() -> None:
+    voice = console.Voice()
+    voice.err = Console(force_terminal=True, width=100, record=True, file=io.StringIO())
+    with console.Progress(voice) as progress:
+        progress("sift", 0.0)
+        progress("sift", 0.5)
+        progress("terrain", 1.0)
+    said = voice.err.export_text()
+    assert "matching image features" in said
+    assert "100%" in said
