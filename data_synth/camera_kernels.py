@@ -10,7 +10,7 @@ from data_synth.seeing_kernels import light_at, through_water
 from meshreg.jit import jit, prange
 
 
-@jit(nogil=True)
+@jit(nogil=True, error_model="numpy")
 def march(z, step, west, north, centre, ray, top):
     """Return (row, col, found) where a ray from `centre` first meets the heightfield.
 
@@ -44,7 +44,7 @@ def march(z, step, west, north, centre, ray, top):
     return 0.0, 0.0, False
 
 
-@jit(parallel=True, nogil=True)
+@jit(parallel=True, nogil=True, error_model="numpy")
 def photograph(z, soft, wide, albedo, step, west, north, centre, turn, focal, shape, image, plan):
     """Linear colour (h, w, 3) f32 seen by a pinhole camera; black where nothing was met.
 
@@ -87,7 +87,7 @@ def photograph(z, soft, wide, albedo, step, west, north, centre, turn, focal, sh
     return out
 
 
-@jit(parallel=True, nogil=True)
+@jit(parallel=True, nogil=True, error_model="numpy")
 def visible(points, z, step, west, north, centre):
     """Whether each world point (N, 3) is in the camera's sight, the heightfield allowing."""
     seen = np.zeros(points.shape[0], np.bool_)

@@ -8,11 +8,10 @@ from __future__ import annotations
 
 import math
 
-from data_synth.noise_kernels import hash01, lumps, octaves
+from data_synth.noise_kernels import hash01, lumps_at, octaves
 from data_synth.types import (
     BOULDER,
     BRANCHING,
-    ENCRUSTING,
     KELP,
     MASSIVE,
     PLATE,
@@ -27,7 +26,7 @@ from meshreg.jit import jit
 NOTHING = -1e30
 
 
-@jit(nogil=True)
+@jit(nogil=True, error_model="numpy")
 def ragged_radius(f, dx, dy, rough, finest):
     """Distance from the centre over the outline's distance there: 1 on the outline.
 
@@ -37,13 +36,13 @@ def ragged_radius(f, dx, dy, rough, finest):
     root = math.sqrt(f.stretch)
     a, b = (c * dx + s * dy) / (f.radius * root), (c * dy - s * dx) * root / f.radius
     rho = math.sqrt(a * a + b * b)
-    if rough > 0.0:
+    if rough > 0.0 and rho * (1.0 - 2.0 * rough) < 1.0:
         stray = octaves(dx, dy, f.seed, 1.1 * f.radius, finest, 0.6, 3)
         rho *= 1.0 + rough * min(2.0, max(-2.0, stray))
     return rho
 
 
-@jit(nogil=True)
+@jit(nogil=True, error_model="numpy")
 def _boulder(f, dx, dy, finest):
     rho = ragged_radius(f, dx, dy, 0.05, finest)
     if rho >= 1.0:
@@ -65,13 +64,13 @@ def _boulder(f, dx, dy, finest):
     return f.z + f.height * up + rough
 
 
-@jit(nogil=True)
+@jit(nogil=True, error_model="numpy")
 def _massive(f, dx, dy, base, finest):
     rho = ragged_radius(f, dx, dy, 0.07, finest)
     if rho >= 1.0:
         return NOTHING, 0.0
     cell = 0.10 + 0.18 * f.radius
-    up, _ = lumps(dx / cell, dy / cell, f.seed + 5, 1.0)
+    up, _ = lumps_at(dx / cell, dy / cell, f.seed + 5, 1.0)
     swell = octaves(dx, dy, f.seed + 8, 0.9 * f.radius, finest, 0.5, 3)
     folds = 0.0  # meandering valleys, as brain corals have
     if f.seed % 3 == 0:
@@ -81,15 +80,15 @@ def _massive(f, dx, dy, base, finest):
     return z - 0.004 * folds, 0.50 + 0.10 * up + 0.08 * swell + 0.10 * dome - 0.28 * folds
 
 
-@jit(nogil=True)
+@jit(nogil=True, error_model="numpy")
 def _branching(f, dx, dy, base, finest):
     rho = ragged_radius(f, dx, dy, 0.13, finest)
     if rho >= 1.0:
         return NOTHING, 0.0
     cell = 0.030 + 0.045 * hash01(1, 1, f.seed)
     bend = 0.4 * cell * octaves(dx, dy, f.seed + 8, 5.0 * cell, finest, 0.5, 1)
-    tip, _ = lumps((dx + bend) / cell, (dy - bend) / cell, f.seed + 5, 1.0)
-    second, _ = lumps((dy + bend) / cell + 0.37, dx / cell + 0.71, f.seed + 6, 0.9)
+    tip, _ = lumps_at((dx + bend) / cell, (dy - bend) / cell, f.seed + 5, 1.0)
+    second, _ = lumps_at((dy + bend) / cell + 0.37, dx / cell + 0.71, f.seed + 6, 0.9)
     tip = max(tip, 0.85 * second)
     crown = (1.0 - rho * rho * rho) * (
         0.85 + 0.15 * octaves(dx, dy, f.seed + 9, 0.9 * f.radius, finest, 0.5, 2)
@@ -100,13 +99,13 @@ def _branching(f, dx, dy, base, finest):
     return z, tip
 
 
-@jit(nogil=True)
+@jit(nogil=True, error_model="numpy")
 def _plate(f, dx, dy, finest):
     rho = ragged_radius(f, dx, dy, 0.12, finest)
     if rho >= 1.0:
         return NOTHING, 0.0
     cell = 0.022
-    knob, _ = lumps(dx / cell, dy / cell, f.seed + 5, 1.0)
+    knob, _ = lumps_at(dx / cell, dy / cell, f.seed + 5, 1.0)
     if 0.5 * cell < finest:
         knob = 0.4
     wave = octaves(dx, dy, f.seed + 8, 0.8 * f.radius, finest, 0.5, 3)
@@ -114,18 +113,18 @@ def _plate(f, dx, dy, finest):
     return z, rho * 0.75 + 0.25 * knob
 
 
-@jit(nogil=True)
+@jit(nogil=True, error_model="numpy")
 def _soft(f, dx, dy, base, finest):
     rho = ragged_radius(f, dx, dy, 0.14, finest)
     if rho >= 1.0:
         return NOTHING, 0.0
     cell = 0.07
-    up, own = lumps(dx / cell, dy / cell, f.seed + 5, 1.0)
+    up, own = lumps_at(dx / cell, dy / cell, f.seed + 5, 1.0)
     z = base + f.height * (1.0 - rho * rho) * (0.6 + 0.4 * up)
     return z, 0.25 + 0.5 * up + 0.25 * own
 
 
-@jit(nogil=True)
+@jit(nogil=True, error_model="numpy")
 def _sponge(f, dx, dy, finest):
     rho = ragged_radius(f, dx, dy, 0.06, finest)
     if rho >= 1.0:
@@ -135,7 +134,7 @@ def _sponge(f, dx, dy, finest):
     return f.z + f.height * max(0.0, ring) * (1.0 + 0.06 * ridge), 0.15 + 0.75 * max(0.0, ring)
 
 
-@jit(nogil=True)
+@jit(nogil=True, error_model="numpy")
 def _urchin(f, dx, dy, base):
     d = math.sqrt(dx * dx + dy * dy) / f.radius
     if d >= 1.0:
@@ -146,7 +145,7 @@ def _urchin(f, dx, dy, base):
     return base + f.height * (1.0 - d)
 
 
-@jit(nogil=True)
+@jit(nogil=True, error_model="numpy")
 def _kelp(f, dx, dy, finest):
     """Blades from one holdfast: `turn` is where the swell lays them in this epoch."""
     best, mark = NOTHING, 0.0
@@ -171,7 +170,7 @@ def _kelp(f, dx, dy, finest):
     return best, mark
 
 
-@jit(nogil=True)
+@jit(nogil=True, error_model="numpy")
 def _white(f, r, g, b, light):
     """Return the colour after bleaching: white with a trace of its own tint."""
     share = f.bleached
@@ -183,7 +182,7 @@ def _white(f, r, g, b, light):
     )
 
 
-@jit(nogil=True)
+@jit(nogil=True, error_model="numpy")
 def _living(f, dx, dy, mark, finest):
     """Colour of a coral's living tissue: `mark` is 0 in the gaps, 1 at tips, lobes and rims."""
     fine = octaves(dx, dy, f.seed + 14, 0.05, finest, 0.6, 3)
@@ -198,7 +197,7 @@ def _living(f, dx, dy, mark, finest):
     return _white(f, r, g, b, light)
 
 
-@jit(nogil=True)
+@jit(nogil=True, error_model="numpy")
 def _overgrown(f, dx, dy, mark, finest):
     fine = octaves(dx, dy, f.seed + 16, 0.06, finest, 0.7, 3)
     grain = octaves(dx, dy, f.seed + 17, 0.010, finest, 0.7, 2)
@@ -206,7 +205,7 @@ def _overgrown(f, dx, dy, mark, finest):
     return 1.12 * light, 1.05 * light, 0.68 * light
 
 
-@jit(nogil=True)
+@jit(nogil=True, error_model="numpy")
 def is_dead_here(f, dx, dy, finest):
     """Whether the surface is dead: whole patches, so that `dead` is the share of the area."""
     if f.dead <= 0.0:
@@ -217,52 +216,44 @@ def is_dead_here(f, dx, dy, finest):
     return field < 2.9 * (f.dead - 0.5)
 
 
-@jit(nogil=True)
-def feature_at(f, x, y, ground_z, finest):
-    """Return (height or NOTHING, red, green, blue, wears the rock's own surface)."""
+@jit(nogil=True, error_model="numpy")
+def feature_height(f, x, y, ground_z, finest):
+    """Return the height of a feature at a point (or NOTHING) and the mark that its colour needs."""
     dx, dy = x - f.x, y - f.y
-    if dx * dx + dy * dy > f.reach * f.reach:
-        return NOTHING, 0.0, 0.0, 0.0, False
+    kind = f.kind
+    if dx * dx + dy * dy > f.reach * f.reach or kind == SEDIMENT or kind == TURF:
+        return NOTHING, 0.0
     base = f.z + 0.35 * (ground_z - f.z)
-    mark = 0.5
-    if f.kind == BOULDER:
-        return _boulder(f, dx, dy, finest), f.red, f.green, f.blue, True
+    if kind == BOULDER:
+        return _boulder(f, dx, dy, finest), 0.5
+    if kind == MASSIVE:
+        return _massive(f, dx, dy, base, finest)
+    if kind == BRANCHING:
+        return _branching(f, dx, dy, base, finest)
+    if kind == PLATE:
+        return _plate(f, dx, dy, finest)
+    if kind == SOFT:
+        return _soft(f, dx, dy, base, finest)
+    if kind == SPONGE:
+        return _sponge(f, dx, dy, finest)
+    if kind == URCHIN:
+        return _urchin(f, dx, dy, ground_z), 0.5
+    if kind == KELP:
+        return _kelp(f, dx, dy, finest)
+    rho = ragged_radius(f, dx, dy, 0.15, finest)  # encrusting
+    if rho >= 1.0:
+        return NOTHING, 0.0
+    up, own = lumps_at(dx / 0.05, dy / 0.05, f.seed + 5, 0.9)
+    return ground_z + f.height * (1.0 - rho * rho) * (0.7 + 0.3 * up), 0.4 + 0.4 * own
+
+
+@jit(nogil=True, error_model="numpy")
+def feature_color(f, dx, dy, mark, finest):
+    """Return the reflectance of a feature (boulders excepted) at a point from its centre [m]."""
     if f.kind == URCHIN:
-        return _urchin(f, dx, dy, ground_z), f.red, f.green, f.blue, False
+        return f.red, f.green, f.blue
     if f.kind == KELP:
-        z, mark = _kelp(f, dx, dy, finest)
-        return z, f.red * mark, f.green * mark, f.blue * mark, False
-    if f.kind == MASSIVE:
-        z, mark = _massive(f, dx, dy, base, finest)
-    elif f.kind == BRANCHING:
-        z, mark = _branching(f, dx, dy, base, finest)
-    elif f.kind == PLATE:
-        z, mark = _plate(f, dx, dy, finest)
-    elif f.kind == SOFT:
-        z, mark = _soft(f, dx, dy, base, finest)
-    elif f.kind == SPONGE:
-        z, mark = _sponge(f, dx, dy, finest)
-    else:  # ENCRUSTING
-        rho = ragged_radius(f, dx, dy, 0.15, finest)
-        if rho >= 1.0:
-            return NOTHING, 0.0, 0.0, 0.0, False
-        up, own = lumps(dx / 0.05, dy / 0.05, f.seed + 5, 0.9)
-        z, mark = ground_z + f.height * (1.0 - rho * rho) * (0.7 + 0.3 * up), 0.4 + 0.4 * own
-    if z < ground_z:
-        return NOTHING, 0.0, 0.0, 0.0, False
+        return f.red * mark, f.green * mark, f.blue * mark
     if is_dead_here(f, dx, dy, finest):
-        r, g, b = _overgrown(f, dx, dy, mark, finest)
-    else:
-        r, g, b = _living(f, dx, dy, mark, finest)
-    return z, r, g, b, False
-
-
-__all__ = [
-    "ENCRUSTING",
-    "KELP",
-    "NOTHING",
-    "SEDIMENT",
-    "TURF",
-    "feature_at",
-    "ragged_radius",
-]
+        return _overgrown(f, dx, dy, mark, finest)
+    return _living(f, dx, dy, mark, finest)

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from data_synth.feature_kernels import NOTHING, feature_at, ragged_radius
-from data_synth.ground_kernels import ground_at, rock_color, sand_color
-from data_synth.noise_kernels import octaves, smoothstep
-from data_synth.types import SEDIMENT, TURF
+from data_synth.feature_kernels import NOTHING, feature_color, feature_height, ragged_radius
+from data_synth.ground_kernels import add_sand, add_turf, ground_block, rock_color
+from data_synth.noise_kernels import octaves, octaves_into, smoothstep
+from data_synth.types import BOULDER, SEDIMENT, TURF
 from meshreg.jit import jit, prange
 
+BLOCK = 1024  # points; all that a block needs fits the second cache
 
-@jit(nogil=True)
+
+@jit(nogil=True, error_model="numpy")
 def _laid(f, x, y, finest):
     """Share 0..1 by which a sediment or turf patch covers this point."""
     dx, dy = x - f.x, y - f.y
@@ -20,112 +22,133 @@ def _laid(f, x, y, finest):
     return 1.0 - smoothstep(0.70, 1.0, ragged_radius(f, dx, dy, 0.16, finest))
 
 
-@jit(nogil=True)
-def surface_at(x, y, ground, features, starts, members, corner, bins, finest, with_color):
-    """Height [m], reflectance and number of the feature on top (-1: ground) at one point.
-
-    `starts` (cells + 1) and `members` list the features that may reach each cell of a lattice
-    with lower left `corner` (2,) [m], `bins` = (columns, rows, cell).
-    """
-    z, sandy, crest, shade, cover = ground_at(x, y, ground, finest)
+@jit(nogil=True, error_model="numpy")
+def _cell(x, y, corner, bins):
     col, row = int((x - corner[0]) / bins[2]), int((y - corner[1]) / bins[2])
     col, row = min(max(col, 0), int(bins[0]) - 1), min(max(row, 0), int(bins[1]) - 1)
-    cell = row * int(bins[0]) + col
-    turf, dust = 0.0, 0.0
-    for k in range(starts[cell], starts[cell + 1]):
-        f = features[members[k]]
-        if f.kind == SEDIMENT:
-            share = _laid(f, x, y, finest)
-            z += f.height * share
-            dust = max(dust, share)
-        elif f.kind == TURF:
-            share = _laid(f, x, y, finest)
-            if share > 0.0:
-                tuft = octaves(x, y, ground.seed + 80, 0.06, finest, 0.75, 4)
-                z += f.height * share * (1.0 - sandy) * (1.0 + 0.25 * tuft)
-            turf = max(turf, share)
-    top, winner = z, -1
-    red, green, blue, rocky = 0.0, 0.0, 0.0, True
-    for k in range(starts[cell], starts[cell + 1]):
-        f = features[members[k]]
-        if f.kind == SEDIMENT or f.kind == TURF:
-            continue
-        up, r, g, b, wears = feature_at(f, x, y, z, finest)
-        if up > top and up > NOTHING:
-            top, winner = up, members[k]
-            red, green, blue, rocky = r, g, b, wears
+    return row * int(bins[0]) + col
+
+
+@jit(nogil=True, error_model="numpy")
+def _lay(x, y, ground, index, finest, z, sandy):
+    """Lay sediment and turf patches on `z`, in place; return their shares (N,) and whether any."""
+    features, starts, members, corner, bins = index
+    dust, turf = np.zeros(x.size), np.zeros(x.size)
+    any_dust, any_turf = False, False
+    for i in range(x.size):
+        cell = _cell(x[i], y[i], corner, bins)
+        for k in range(starts[cell], starts[cell + 1]):
+            f = features[members[k]]
+            if f.kind != SEDIMENT and f.kind != TURF:
+                continue
+            share = _laid(f, x[i], y[i], finest)
+            if share <= 0.0:
+                continue
+            if f.kind == SEDIMENT:
+                z[i] += f.height * share
+                dust[i] = max(dust[i], share)
+                any_dust = True
+            else:
+                tuft = octaves(x[i], y[i], ground.seed + 80, 0.06, finest, 0.75, 4)
+                z[i] += f.height * share * (1.0 - sandy[i]) * (1.0 + 0.25 * tuft)
+                turf[i] = max(turf[i], share)
+                any_turf = True
+    return dust, turf, any_dust, any_turf
+
+
+@jit(nogil=True, error_model="numpy")
+def _block(x, y, ground, index, finest, with_color, height, color, winner):
+    """Evaluate one block of points into `height`, `color` and `winner`."""
+    features, starts, members, corner, bins = index
+    n = x.size
+    z, sandy, crest, shade, cover = ground_block(x, y, ground, finest)
+    dust, turf, any_dust, any_turf = _lay(x, y, ground, index, finest, z, sandy)
+    mark = np.zeros(n)
+    paint_x, paint_y = x.copy(), y.copy()
+    for i in range(n):
+        cell = _cell(x[i], y[i], corner, bins)
+        top, who = z[i], -1
+        for k in range(starts[cell], starts[cell + 1]):
+            f = features[members[k]]
+            up, m = feature_height(f, x[i], y[i], z[i], finest)
+            if up > top and up > NOTHING:
+                top, who, mark[i] = up, members[k], m
+        height[i], winner[i] = top, who
+        if who >= 0 and features[who].kind == BOULDER:
+            # a boulder carries its own skin with it
+            f = features[who]
+            paint_x[i], paint_y[i] = x[i] - f.x + 37.0 * (f.seed % 97), y[i] - f.y
+            shade[i], cover[i] = 0.5 + 0.5 * (top - f.z) / f.height, 0.0
     if not with_color:
-        return top, 0.0, 0.0, 0.0, winner
-    if winner >= 0 and rocky:
-        f = features[winner]
-        r, g, b = rock_color(
-            x - f.x + 37.0 * (f.seed % 97), y - f.y, ground, 0.5 + 0.5 * (top - f.z) / f.height, 0.0, finest
-        )
-        red, green, blue = r * red, g * green, b * blue
-    elif winner < 0:
-        red, green, blue = rock_color(x, y, ground, shade, cover, finest)
-        if turf > 0.0:
-            tuft = octaves(x, y, ground.seed + 80, 0.06, finest, 0.75, 4)
-            clump = octaves(x, y, ground.seed + 81, 0.5, finest, 0.6, 2)
-            light = (0.5 + 0.5 * shade) * (1.0 + 0.22 * tuft + 0.15 * clump)
-            red += turf * ((0.085 + 0.012 * clump) * light - red)
-            green += turf * (0.085 * light - green)
-            blue += turf * (0.038 * light - blue)
-        share = max(sandy, 0.92 * dust)
-        if share > 0.0:
-            r, g, b = sand_color(x, y, ground, crest if sandy > 0.5 else 0.5, finest)
-            share = smoothstep(0.15, 0.6, share)
-            red, green, blue = red + share * (r - red), green + share * (g - green), blue + share * (b - blue)
-    return top, red, green, blue, winner
+        return
+    rock_color(paint_x, paint_y, ground, shade, cover, finest, color)
+    if any_turf:
+        add_turf(x, y, ground, shade, turf, finest, color)
+    most = 0.0
+    for i in range(n):
+        bare = 0.0 if winner[i] >= 0 else 1.0
+        if sandy[i] < dust[i]:
+            crest[i] = 0.5
+        sandy[i] = bare * smoothstep(0.15, 0.6, max(sandy[i], 0.92 * dust[i]))
+        most = max(most, sandy[i])
+    if most > 0.0:
+        add_sand(x, y, ground, sandy, crest, finest, color)
+    for i in range(n):
+        if winner[i] >= 0:
+            f = features[winner[i]]
+            if f.kind == BOULDER:
+                color[i, 0] *= f.red
+                color[i, 1] *= f.green
+                color[i, 2] *= f.blue
+            else:
+                r, g, b = feature_color(f, x[i] - f.x, y[i] - f.y, mark[i], finest)
+                color[i, 0], color[i, 1], color[i, 2] = r, g, b
 
 
-@jit(parallel=True, nogil=True)
+@jit(parallel=True, nogil=True, error_model="numpy")
 def evaluate(x, y, ground, features, starts, members, corner, bins, finest):
-    """Evaluate flat arrays of points: height (N,), reflectance (N, 3) f32, winner (N,) i32."""
+    """Evaluate flat arrays of points: height (N,), reflectance (N, 3) f32, winner (N,) i32.
+
+    `starts` (cells + 1) and `members` list the features that may reach each cell of a lattice
+    with lower left `corner` (2,) [m], `bins` = (columns, rows, cell). Winner -1 is the ground.
+    """
     n = x.size
     height, color = np.empty(n), np.empty((n, 3), np.float32)
     winner = np.empty(n, np.int32)
-    block = 4096
-    for part in prange((n + block - 1) // block):
-        for i in range(part * block, min(n, (part + 1) * block)):
-            z, r, g, b, w = surface_at(
-                x[i], y[i], ground, features, starts, members, corner, bins, finest, True
-            )
-            height[i], winner[i] = z, w
-            color[i, 0], color[i, 1], color[i, 2] = r, g, b
+    for part in prange((n + BLOCK - 1) // BLOCK):
+        a, b = part * BLOCK, min(n, (part + 1) * BLOCK)
+        index = (features, starts, members, corner, bins)
+        _block(x[a:b], y[a:b], ground, index, finest, True, height[a:b], color[a:b], winner[a:b])
     return height, color, winner
 
 
-@jit(parallel=True, nogil=True)
+@jit(parallel=True, nogil=True, error_model="numpy")
 def evaluate_height(x, y, ground, features, starts, members, corner, bins, finest):
     """Heights only, (N,) [m]."""
     n = x.size
     height = np.empty(n)
-    block = 4096
-    for part in prange((n + block - 1) // block):
-        for i in range(part * block, min(n, (part + 1) * block)):
-            height[i] = surface_at(
-                x[i], y[i], ground, features, starts, members, corner, bins, finest, False
-            )[0]
+    for part in prange((n + BLOCK - 1) // BLOCK):
+        a, b = part * BLOCK, min(n, (part + 1) * BLOCK)
+        index = (features, starts, members, corner, bins)
+        color, winner = np.empty((1, 3), np.float32), np.empty(b - a, np.int32)
+        _block(x[a:b], y[a:b], ground, index, finest, False, height[a:b], color, winner)
     return height
 
 
-@jit(parallel=True, nogil=True)
+@jit(parallel=True, nogil=True, error_model="numpy")
 def evaluate_ground(x, y, ground, finest):
     """Bare ground without features: height (N,) [m] and sandiness 0..1 (N,)."""
     n = x.size
     height, sandy = np.empty(n), np.empty(n)
-    for i in prange(n):
-        z, s, _, _, _ = ground_at(x[i], y[i], ground, finest)
-        height[i], sandy[i] = z, s
+    for part in prange((n + BLOCK - 1) // BLOCK):
+        a, b = part * BLOCK, min(n, (part + 1) * BLOCK)
+        height[a:b], sandy[a:b], _, _, _ = ground_block(x[a:b], y[a:b], ground, finest)
     return height, sandy
 
 
-@jit(parallel=True, nogil=True)
+@jit(nogil=True, error_model="numpy")
 def evaluate_noise(x, y, seed, wavelength):
     """Plain noise of standard deviation about 1 at points (N,)."""
-    n = x.size
-    value = np.empty(n)
-    for i in prange(n):
-        value[i] = octaves(x[i], y[i], seed, wavelength, 0.0, 0.6, 3)
+    value = np.zeros(x.size)
+    octaves_into(x, y, seed, wavelength, 0.0, 0.6, 3, 1.0, value)
     return value

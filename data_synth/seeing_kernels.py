@@ -6,11 +6,11 @@ import math
 
 import numpy as np
 
-from data_synth.noise_kernels import gradient_noise, hash01, octaves
+from data_synth.noise_kernels import gradient_noise, hash01, hash2, octaves_into
 from meshreg.jit import jit, prange
 
 
-@jit(nogil=True)
+@jit(nogil=True, error_model="numpy")
 def nearest_camera(x, y, plan):
     """Return offset from the camera whose image was used here, its number pair and altitude.
 
@@ -26,8 +26,9 @@ def nearest_camera(x, y, plan):
     best, dx, dy, na, nc = 1e30, 0.0, 0.0, 0, 0
     for j in range(-1, 2):
         for i in range(-1, 2):
-            ca = ia + i + 0.5 + 0.5 * (hash01(ia + i, ic + j, plan.seed + 3) - 0.5)
-            cc = ic + j + 0.5 + 0.35 * (hash01(ia + i, ic + j, plan.seed + 4) - 0.5)
+            h = hash2(ia + i, ic + j, plan.seed + 3)
+            ca = ia + i + 0.25 + 0.5 * np.float64(h & 0xFFFF) / 65536.0
+            cc = ic + j + 0.325 + 0.35 * np.float64((h >> 16) & 0xFFFF) / 65536.0
             da, dc = (along - ca) * plan.image_spacing, (across - cc) * plan.track_spacing
             d2 = da * da + dc * dc
             if d2 < best:
@@ -37,7 +38,7 @@ def nearest_camera(x, y, plan):
     return dx, dy, na, nc, high
 
 
-@jit(nogil=True)
+@jit(nogil=True, error_model="numpy")
 def shadow(z, i, j, step, east, north, rise):
     """Share of a lamp's light that reaches sample (i, j): 0 in shadow, 1 in the open.
 
@@ -59,7 +60,7 @@ def shadow(z, i, j, step, east, north, rise):
     return light
 
 
-@jit(nogil=True)
+@jit(nogil=True, error_model="numpy")
 def light_at(z, soft, wide, i, j, step, x, y, mirror, away, high, image, plan):
     """Light on sample (i, j) at centred (x, y): sky, sun and the lamps beside the camera.
 
@@ -109,7 +110,7 @@ def light_at(z, soft, wide, i, j, step, x, y, mirror, away, high, image, plan):
     return light
 
 
-@jit(nogil=True)
+@jit(nogil=True, error_model="numpy")
 def through_water(albedo, light, view, high, image, plan, out):
     """Put what a camera at distance `view` [m] sees of a lit spot into `out` (3,)."""
     edge = (high / view) ** (4.0 * plan.vignette)
@@ -117,13 +118,14 @@ def through_water(albedo, light, view, high, image, plan, out):
     attenuation = (plan.attenuation_red, plan.attenuation_green, plan.attenuation_blue)
     haze = (plan.haze_red, plan.haze_green, plan.haze_blue)
     for k in range(3):
-        clear = math.exp(-attenuation[k] * (view - plan.altitude * plan.corrected))
-        veil = haze[k] * (1.0 - math.exp(-attenuation[k] * view))
+        left = math.exp(-attenuation[k] * view)
+        clear = left * math.exp(attenuation[k] * plan.altitude * plan.corrected)
+        veil = haze[k] * (1.0 - left)
         tint = 1.0 + 0.5 * plan.seams * (hash01(image[0], image[1], plan.seed + 8 + k) - 0.5)
         out[k] = (albedo[k] * light * clear + veil) * gain * tint
 
 
-@jit(parallel=True, nogil=True)
+@jit(parallel=True, nogil=True, error_model="numpy")
 def radiance(z, soft, wide, albedo, step, west, north, mirror, plan):
     """Linear colour (H, W, 3) f32 that the cameras saw of a lattice of the seafloor.
 
@@ -154,7 +156,7 @@ def radiance(z, soft, wide, albedo, step, west, north, mirror, plan):
     return out
 
 
-@jit(parallel=True, nogil=True)
+@jit(parallel=True, nogil=True, error_model="numpy")
 def encode(linear, scale, gamma, noise, seed, west, north, step):
     """Linear colour to 8 bits: exposure per channel `scale` (3,), gamma, sensor noise [counts]."""
     rows, cols, _ = linear.shape
@@ -177,16 +179,18 @@ def encode(linear, scale, gamma, noise, seed, west, north, step):
     return out
 
 
-@jit(parallel=True, nogil=True)
+@jit(parallel=True, nogil=True, error_model="numpy")
 def blotches(x, y, seed, wavelength, count):
     """Noise of standard deviation about 1 at points (N,), for holes, edges and height noise."""
-    out = np.empty(x.size)
-    for i in prange(x.size):
-        out[i] = octaves(x[i], y[i], seed, wavelength, 0.0, 0.65, count)
+    out = np.zeros(x.size)
+    block = 4096
+    for part in prange((x.size + block - 1) // block):
+        a, b = part * block, min(x.size, (part + 1) * block)
+        octaves_into(x[a:b], y[a:b], seed, wavelength, 0.0, 0.65, count, 1.0, out[a:b])
     return out
 
 
-@jit(parallel=True, nogil=True)
+@jit(parallel=True, nogil=True, error_model="numpy")
 def bilinear(raster, row, col):
     """Values (N,) of a raster (H, W) between its samples; beyond the border the border's."""
     rows, cols = raster.shape

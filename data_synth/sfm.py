@@ -84,22 +84,21 @@ class Distortion:
 
     def reference_from_moving(self, points: Float64) -> Float64:
         """Lay absolute points (N, 3) of the moving survey on the reference."""
-        from data_synth.sfm_kernels import to_world
-
-        local = np.ascontiguousarray(np.atleast_2d(points) - self.start)
-        world: Float64 = to_world(local, self.linear, *self.warp)
-        return world + self.centre
+        q = (np.atleast_2d(points) - self.start) @ self.linear.T
+        return q + self.displacement(q) + self.centre
 
     def moving_from_reference(self, points: Float64) -> Float64:
         """Inverse of `reference_from_moving`, to about 1e-12 m."""
         from data_synth.sfm_kernels import from_world
 
-        local = np.ascontiguousarray(np.atleast_2d(points) - self.centre)
-        moved: Float64 = from_world(local, np.linalg.inv(self.linear), *self.warp)
+        world = np.atleast_2d(points) - self.centre
+        x, y = (np.ascontiguousarray(world[:, k]) for k in (0, 1))
+        q = world - from_world(x, y, *self.warp)
+        moved: Float64 = q @ np.linalg.inv(self.linear).T
         return moved + self.start
 
     def displacement(self, points: Float64) -> Float64:
-        """Warp (N, 3) [m] at world points (N, 2), the patch's centre being (0, 0)."""
+        """Warp (N, 3) [m] at points q (N, 2 or 3), the patch's centre being (0, 0)."""
         from data_synth.sfm_kernels import bend_many
 
         x, y = (np.ascontiguousarray(points[:, k]) for k in (0, 1))

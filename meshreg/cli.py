@@ -322,8 +322,8 @@ def demo(
 
     voice = _voice(as_json)
     request = demo_request(out, overwrite)
-    voice.say("Two drone surveys of one beach, eight months apart; the second lies wrong by")
-    voice.say("east −13.4 m, north +8.7 m, up −1.25 m. It is laid back:")
+    voice.say("Two drone surveys of one beach, eight months apart; the later one was moved on")
+    voice.say("purpose. To find: about +13.4 m east, -8.7 m north, +1.25 m up, within 2 m.")
     return _do_register(request, voice)
 
 

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from meshreg.offsets import neutral
-from meshreg.offsets.correlate import Window
+from meshreg.offsets.correlate import Correlator, Window
 from meshreg.offsets.surface import Peak, find_peak, gap_at
 from meshreg.settings import JudgeSettings, Settings
 from meshreg.types import Float64, OffsetEstimate, SurveyRaster, Verdict
@@ -162,25 +162,34 @@ def channel_map(
     )
     if min(int(mask.sum()) for mask in valid) < 100:
         return None
-    window = Window.around(reference.grid, moving.grid, radius)
-    if window.empty:
-        return None
     first, second = neutral.fields(reference, channel), neutral.fields(moving, channel)
-    surface, counts = neutral.surface(first, second, window, min_overlap)
-    exclusion = max(0.5, 5 * window.cell)
-    peak = find_peak(surface, window.east, window.north, exclusion)
-    if peak is None:
+    transformed: dict[tuple[int, int], neutral.Spectra] = {}
+
+    def look(turn: int, flip: bool) -> tuple[Window, Float64, Float64, Peak | None] | None:
+        """Evidence and its peak, with the moving survey turned and mirrored."""
+        window = Window.around(reference.grid, neutral.turned_grid(moving.grid, turn), radius)
+        if window.empty:
+            return None
+        correlator = Correlator(window, single=True)
+        if window.padded not in transformed:
+            transformed[window.padded] = neutral.spectra(first, correlator)
+        other = neutral.spectra(second.turned(turn, flip), correlator)
+        surface, counts = neutral.surface(
+            transformed[window.padded], other, correlator, min_overlap
+        )
+        exclusion = max(0.5, 5 * window.cell)
+        return window, surface, counts, find_peak(surface, window.east, window.north, exclusion)
+
+    seen = look(0, False)
+    if seen is None or seen[3] is None:
         return None
+    window, surface, counts, peak = seen
     turned: dict[str, float] = {}
     for turn, flip in TURNS:
-        grid = neutral.turned_grid(moving.grid, turn)
-        null_window = Window.around(reference.grid, grid, radius)
-        fields = [neutral.mirrored(f, turn, flip) for f in second]
-        null, _ = neutral.surface(first, fields, null_window, min_overlap)
-        null_peak = find_peak(null, null_window.east, null_window.north, exclusion)
-        if null_peak is not None:
-            turned[TURN_NAMES[turn, flip]] = null_peak.gap
-    # the theory of extremes gives 1/sqrt(2 ln M) for M independent offsets: about 0.3. A map
+        null = look(turn, flip)
+        if null is not None and null[3] is not None:
+            turned[TURN_NAMES[turn, flip]] = null[3].gap
+    # The theory of extremes gives 1/sqrt(2 ln M) for M independent offsets: about 0.3. A map
     # that matches by chance of symmetry (or because the survey IS mirrored) must not widen the
     # scale for the rest, hence the median; ln 2 turns an exponential's median into its mean.
     gaps = list(turned.values())

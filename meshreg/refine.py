@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from meshreg.offsets import neutral
-from meshreg.offsets.correlate import Window
+from meshreg.offsets.correlate import Correlator, Window
 from meshreg.offsets.surface import MAD_TO_SIGMA, find_peak
 from meshreg.types import Float64, SurveyRaster
 
@@ -166,8 +166,8 @@ def tile_offsets(
 
 
 def _match_tile(
-    first: Sequence[neutral.Field],
-    second: Sequence[neutral.Field],
+    first: neutral.Fields,
+    second: neutral.Fields,
     tile: tuple[int, int, int],
     shift: tuple[int, int],
     reach: int,
@@ -175,31 +175,32 @@ def _match_tile(
 ) -> tuple[float, float] | None:
     """Offset (east, north) [m] of one tile from the common shift; None where it has no peak."""
     top, left, side = tile
-    t, l = max(0, top + shift[0] - reach), max(0, left + shift[1] - reach)  # noqa: E741
-    big = (slice(t, top + shift[0] + side + reach), slice(l, left + shift[1] + side + reach))
+    up, west = max(0, top + shift[0] - reach), max(0, left + shift[1] - reach)
+    big = (
+        slice(up, top + shift[0] + side + reach),
+        slice(west, left + shift[1] + side + reach),
+    )
     small = (slice(top, top + side), slice(left, left + side))
-    a = [_cut(f, big) for f in first]
-    b = [_cut(f, small) for f in second]
-    if b[0].mask.mean() < 0.5 or a[0].mask.mean() < 0.5:
+    a, b = first.mapped(lambda f: f[big]), second.mapped(lambda f: f[small])
+    if b.mask.mean() < 0.5 or a.mask.mean() < 0.5:
         return None
     steps = np.arange(-reach, reach + 1)
     window = Window(
         cell,
-        steps + (top + shift[0] - t),
-        steps + (left + shift[1] - l),
+        steps + (top + shift[0] - up),
+        steps + (left + shift[1] - west),
         np.asarray(steps * cell, np.float64),
         np.asarray(-steps * cell, np.float64),
-        (a[0].mask.shape, b[0].mask.shape),
+        (a.mask.shape, b.mask.shape),
     )
-    surface, _ = neutral.surface(a, b, window, 0.5)
+    correlator = Correlator(window)
+    surface, _ = neutral.surface(
+        neutral.spectra(a, correlator), neutral.spectra(b, correlator), correlator, 0.5
+    )
     peak = find_peak(surface, window.east, window.north, exclusion=3 * cell)
     if peak is None or peak.border or peak.gap < 0.5:
         return None
     return peak.east, peak.north
-
-
-def _cut(field: neutral.Field, part: tuple[slice, slice]) -> neutral.Field:
-    return neutral.Field(field.name, tuple(p[part] for p in field.parts), field.mask[part])
 
 
 def fit(tiles: TileOffsets, pivot: Float64, *, yaw_free: bool, iterations: int = 20) -> Refined:

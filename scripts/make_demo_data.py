@@ -19,9 +19,9 @@ from PIL import Image
 TARGET = Path(__file__).parent.parent / "meshreg" / "demo_data"
 MOVED = np.array([13.4, -8.7])  # the later survey was moved by minus this, and by -1.25 m up
 # West, south, east, north on the ground [m]. They differ, so that the cut edges give nothing away.
-EARLIER = (450.0, 250.0, 620.0, 420.0)
-LATER = (439.0, 262.0, 611.0, 431.0)
-STEP = 2
+EARLIER = (457.0, 362.0, 543.0, 448.0)
+LATER = (448.0, 374.0, 535.0, 460.0)
+STEP = 1
 
 
 def read(path: Path) -> tuple[np.ndarray, np.ndarray]:

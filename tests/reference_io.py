@@ -69,8 +69,8 @@ def spliced(line: bytes, delimiter: str, words: dict[int, bytes]) -> bytes:
         start = line.index(field, at)
         out += line[at:start] + words.get(number, field)
         at = start + len(field)
-        if delimiter != " " and at < len(line):
-            mark = line.index(delimiter.encode(), at)
+        mark = -1 if delimiter == " " else line.find(delimiter.encode(), at)
+        if mark >= 0:
             out += line[at : mark + 1]
             at = mark + 1
     return out + line[at:]

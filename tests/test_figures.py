@@ -152,7 +152,7 @@ def test_matches_are_joined_between_their_ends(accepted: Registration) -> None:
     lines = {tuple(np.round([*a.xy1, *a.xy2], 6)) for a in figure.artists}
     ends = np.hstack([matches["reference_points"] - corner, matches["moving_points"] - corner])
     assert lines == {tuple(row) for row in np.round(ends, 6)}
-    assert "70 inliers of 180 (38.9%)" in figure.get_suptitle()
+    assert "70 of 180 matches agree (38.9%)" in figure.get_suptitle()
 
 
 def test_many_matches_are_thinned_evenly(accepted: Registration) -> None:
@@ -190,7 +190,24 @@ def test_residual_arrows_point_where_the_residuals_do(accepted: Registration) ->
     np.testing.assert_array_equal(arrows.V, field["d_north"])
     place = style.Place(accepted.evidence["reference_dem"].grid)
     np.testing.assert_allclose(arrows.get_offsets()[:, 0], field["east"] - place.east)
+    assert axes.collections[-1] is arrows  # no tile was set aside
     assert residuals.draw_residuals(replaced(accepted, residuals={})) is None
+
+
+def test_tiles_without_weight_do_not_set_the_scale(accepted: Registration) -> None:
+    field = {k: np.append(v, v[:1]) for k, v in accepted.evidence["residuals"].items()}
+    field["d_east"][-1], field["weight"][-1] = 40.0, 1e-6
+    figure = residuals.draw_residuals(replaced(accepted, residuals=field))
+    plain = residuals.draw_residuals(accepted)
+    shown = [
+        next(c for c in f.axes[0].collections if type(c).__name__ == "Quiver")
+        for f in (figure, plain)
+    ]
+    np.testing.assert_array_equal(shown[0].U, shown[1].U)
+    assert "30 of 31 tiles" in figure.get_supxlabel()
+    weight, left = field["weight"][:-1], np.hypot(field["d_east"], field["d_north"])[:-1]
+    rms = np.sqrt((weight * left**2).sum() / weight.sum())
+    assert f"rms {1000 * rms:.1f} mm" in figure.get_supxlabel()
 
 
 def test_height_difference_is_moving_minus_reference(accepted: Registration) -> None:
@@ -331,13 +348,14 @@ def test_scene_is_rendered_in_a_child(tmp_path: Path, accepted: Registration) ->
     path = scene.draw_scene(accepted, tmp_path / "scene.png", 120)
     assert path == tmp_path / "scene.png"
     with Image.open(path) as image:
-        assert image.size == (1800, 900)
-        grey = np.asarray(image.convert("L"), float)[100:]
-    # Both halves show the surface, seen from the same place, on white.
-    left, right = grey[:, :900], grey[:, 900:]
-    for half in (left, right):
-        assert 0.15 < (half < 250).mean() < 0.95
-    assert np.abs(left - right).mean() < 12
+        assert max(image.size) <= style.MAX_PIXELS
+        grey = np.asarray(image.convert("L"), float)[40:]
+    # Both halves show the surface, seen from the same place, on white, and fill the picture.
+    half = grey.shape[1] // 2
+    left, right = grey[:, :half], grey[:, half : 2 * half]
+    for part in (left, right):
+        assert 0.3 < (part < 250).mean() < 0.95
+    assert np.abs(left - right).mean() < 15
 
 
 def test_scene_that_cannot_be_rendered_is_skipped_with_a_note(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import sys
 import time
 from collections.abc import Iterator
@@ -22,6 +23,7 @@ STAGES = {
     "terrain": "scanning the terrain",
     "mutual_information": "scanning for mutual information",
     "judge": "judging",
+    "refine": "refining",
     "apply": "checking the result",
     "write": "writing",
     "figures": "drawing figures",
@@ -33,7 +35,9 @@ class Voice:
 
     def __init__(self, as_json: bool = False) -> None:
         self.as_json = as_json
-        self.out = Console(highlight=False, soft_wrap=not sys.stdout.isatty())
+        # Where nobody watches, lines may be wider than the 80 columns of an unknown terminal.
+        wide = None if sys.stdout.isatty() or "COLUMNS" in os.environ else 120
+        self.out = Console(highlight=False, width=wide)
         self.err = Console(stderr=True, highlight=False, soft_wrap=True, quiet=as_json)
 
     def document(self, document: Any) -> None:
@@ -46,7 +50,7 @@ class Voice:
     def say(self, text: str, **styles: Any) -> None:
         """Print a line of the result; `text` is rich markup, so names in it must be escaped."""
         if not self.as_json:
-            self.out.print(text, **styles)
+            self.out.print(text, soft_wrap=not self.out.is_terminal, **styles)
 
     def warn(self, text: str) -> None:
         """Print a warning on stderr."""

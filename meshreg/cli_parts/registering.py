@@ -83,7 +83,7 @@ def register(request: RegisterRequest, voice: Voice, unfinished: Unfinished) -> 
             notes=(*registration.notes, *notes),
             seconds={"read": reading, **registration.seconds},
         )
-        LOG.info("%s: %s", registration.verdict, registration.reason)
+        _log_result(registration)
         progress("write", 0.0)
         write_record_files(registration, folder, reference=reference, moving=moving)
         progress("figures", 0.0)
@@ -100,6 +100,19 @@ def _log_start(request: RegisterRequest) -> None:
     LOG.info("settings %s", request.settings.as_dict())
 
 
+def _log_result(registration: Registration) -> None:
+    for e in registration.estimates:
+        found = f"east {e.east:+.4f} m, north {e.north:+.4f} m, gap {e.gap:.2f}"
+        LOG.info("%s: %s; %s; %s", e.method, e.status, found, e.reason)
+    for place, hypothesis in enumerate(registration.hypotheses, 1):
+        LOG.info("hypothesis %d: %s", place, dict(hypothesis))
+    for stage, seconds in registration.seconds.items():
+        LOG.info("%s took %.2f s", stage, seconds)
+    if registration.transform is not None:
+        LOG.info("offset (east, north, up) [m]: %s", registration.transform.offset.tolist())
+    LOG.info("%s: %s", registration.verdict, registration.reason)
+
+
 def demo_request(out: Path, overwrite: bool) -> RegisterRequest:
     """Return the main job on the pair of surveys that the package carries."""
     from meshreg.io.options import ReadOptions
@@ -108,6 +121,6 @@ def demo_request(out: Path, overwrite: bool) -> RegisterRequest:
         SurveyRequest(str(DEMO / "beach_2018.obj"), ReadOptions()),
         SurveyRequest(str(DEMO / "beach_2019.obj"), ReadOptions()),
         out,
-        settings=Settings().changed({"search.radius": 30.0}),
+        settings=Settings().changed({"search.radius": 20.0}),
         overwrite=overwrite,
     )

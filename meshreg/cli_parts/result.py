@@ -34,18 +34,20 @@ def show(registration: Registration, out: Path, voice: Voice) -> None:
     """Print the verdict, the offset, each method's answer, and where the files are."""
     color = _COLORS[registration.verdict]
     reason = registration.reason.strip()
-    text = f"[bold {color}]{registration.verdict.upper()}[/]  {escape(reason)}"
-    voice.out.print(Panel(text, border_style=color, expand=False))
+    voice.say(f"[bold {color}]{registration.verdict.upper()}[/]: {escape(reason)}")
     if registration.transform is not None:
         _print_offset(registration, voice)
     voice.out.print(_methods(registration))
+    for estimate in registration.estimates:
+        if estimate.reason:
+            voice.say(f"  {escape(estimate.method)}: {escape(estimate.reason)}")
     if statistics := _statistics(registration):
         voice.out.print(statistics)
     for note in registration.notes:
-        voice.out.print(f"[dim]note:[/] {escape(note)}")
-    voice.out.print(f"Written to [bold]{escape(str(out))}[/]: {escape(_contents(out))}")
+        voice.say(f"[dim]note:[/] {escape(note)}")
+    voice.say(f"Written to [bold]{escape(str(out))}[/]: {escape(_contents(out))}")
     if registration.verdict in _NEXT:
-        voice.out.print(f"[yellow]next:[/] {_NEXT[registration.verdict]}")
+        voice.say(f"[yellow]next:[/] {_NEXT[registration.verdict]}")
 
 
 def _print_offset(registration: Registration, voice: Voice) -> None:
@@ -78,7 +80,6 @@ def _methods(registration: Registration) -> Table:
         table.add_column(column)
     for column in ("east [m]", "north [m]", "sigma [m]", "gap", "seconds"):
         table.add_column(column, justify="right")
-    table.add_column("reason", overflow="fold")
     for estimate in registration.estimates:
         color = _STATUS_COLORS[estimate.status]
         table.add_row(
@@ -89,7 +90,6 @@ def _methods(registration: Registration) -> Table:
             _sigma(estimate),
             _number(estimate.gap, ".1f"),
             _number(estimate.seconds, ".1f"),
-            escape(estimate.reason),
         )
     return table
 

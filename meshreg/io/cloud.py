@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from meshreg.errors import InputError
 from meshreg.io.cloud_write import rewrite, write
 from meshreg.io.frames import place
-from meshreg.io.las_header import LasHead, check_header, file_crs, las_errors
+from meshreg.io.las_header import LasHead, check_header, file_crs
+from meshreg.io.laz_chunks import las_errors
 from meshreg.io.options import ReadOptions
 from meshreg.io.safe import fingerprint, open_regular, sha256
 from meshreg.io.sidecar import find_sidecar

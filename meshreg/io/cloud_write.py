@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from meshreg.errors import OutputError, UsageError
-from meshreg.io.las_header import CRS_RECORDS, check_header, las_errors
+from meshreg.io.las_header import CRS_RECORDS, check_header
+from meshreg.io.laz_chunks import las_errors
 from meshreg.io.mover import Mover, is_plain
 from meshreg.io.rewriting import require_unchanged
 from meshreg.io.safe import atomic_file

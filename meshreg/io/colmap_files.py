@@ -172,14 +172,23 @@ def read_model(files: ModelFiles) -> tuple[Model, Any]:
         )
     if files.suffix == ".txt":
         _check_text_counts(files, model)
-    return _plain(model, posed), model
+    return _plain(files, model, posed), model
 
 
-def _plain(model: Any, posed: list[Any]) -> Model:
+def _plain(files: ModelFiles, model: Any, posed: list[Any]) -> Model:
     points = [point for _, point in sorted(model.points3D.items())]
     poses = [camera_from_world(image) for image in posed]
     turns = np.array([pose.rotation.matrix() for pose in poses])
     shifts = np.array([pose.translation for pose in poses])
+    with np.errstate(all="ignore"):
+        sound = np.abs(turns @ turns.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2)) < 1e-3
+        sound &= np.isfinite(shifts).all(axis=1)
+    if not sound.all():
+        raise InputError(
+            f"holds an image whose pose is none: {_image_name(posed[int(np.argmin(sound))])!r}.",
+            file=files.folder / f"images{files.suffix}",
+            remedy=_AGAIN,
+        )
     return Model(
         points=np.array([point.xyz for point in points], float).reshape(-1, 3),
         colors=np.array([point.color for point in points], np.uint8).reshape(-1, 3),

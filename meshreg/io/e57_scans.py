@@ -46,7 +46,7 @@ def library(path: Path) -> Any:
 def _in_plain_words(libe57: Any, path: Path) -> Iterator[None]:
     try:
         yield
-    except libe57.E57Exception as error:
+    except (libe57.E57Exception, UnicodeDecodeError) as error:  # damage can stand in the message
         raise InputError(
             f"cannot be read: {str(error).splitlines()[0].strip()}.",
             file=path,

@@ -190,7 +190,7 @@ class _Walk:
     def __init__(self, xml: bytes, path: Path) -> None:
         self.xml, self.path = xml, path
         self.stack: list[str] = []
-        self.text = ""
+        self.text, self.childless = "", False
         self.entries: list[Entry] = []
         self.crs: str | None = None
         self.crs_span = (0, 0)
@@ -203,7 +203,7 @@ class _Walk:
 
     def start(self, name: str, attributes: dict[str, str]) -> None:
         self.stack.append(name)
-        self.text = ""
+        self.text, self.childless = "", True
         if len(self.stack) > MAX_DEPTH:
             raise InputError(
                 f"nests its XML deeper than {MAX_DEPTH} elements.",
@@ -228,8 +228,14 @@ class _Walk:
             entry.fields[name] = _field(name, attributes)
 
     def _tag_end(self) -> int:
-        """Return where the end tag (or empty element) that is being reported ends."""
-        return self.xml.index(b">", self.parser.CurrentByteIndex) + 1
+        """Return where the element whose end is being reported ends.
+
+        expat points at its end tag, but behind it where it is written as one empty tag.
+        """
+        here = self.parser.CurrentByteIndex
+        if self.childless and self.xml[here - 2 : here] == b"/>":
+            return here
+        return self.xml.index(b">", here) + 1
 
     def characters(self, text: str) -> None:
         self.text += text
@@ -247,7 +253,7 @@ class _Walk:
         elif inner and self.entries:
             self._end_in_entry(inner, text)
         self.stack.pop()
-        self.text = ""
+        self.text, self.childless = "", False
 
     def _end_in_entry(self, inner: list[str], text: str) -> None:
         entry = self.entries[-1]

@@ -32,39 +32,48 @@ def use_faces(points: Any, faces: Any, table: Any, keep: Any) -> tuple[int, int,
     lost, flat, copies = 0, 0, 0
     for face in range(len(faces)):
         i, j, k = faces[face, 0], faces[face, 1], faces[face, 2]
-        keep[face] = False
         ax, ay, az = points[i, 0], points[i, 1], points[i, 2]
         ux, uy, uz = points[j, 0] - ax, points[j, 1] - ay, points[j, 2] - az
         vx, vy, vz = points[k, 0] - ax, points[k, 1] - ay, points[k, 2] - az
         nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
         area = nx * nx + ny * ny + nz * nz
-        if not np.isfinite(area):
-            lost += 1
+        if not 0.0 < area < np.inf:
+            keep[face] = False
+            flat += area == 0.0
+            lost += area != 0.0
             continue
-        if area == 0.0:
-            flat += 1
-            continue
-        low, high = min(i, j, k), max(i, j, k)
-        mixed = (
-            np.uint64(low) * np.uint64(0x9E3779B97F4A7C15)
-            ^ np.uint64(i ^ j ^ k) * np.uint64(0xC2B2AE3D27D4EB4F)
-            ^ np.uint64(high) * np.uint64(0x165667B19E3779F9)
-        )
-        slot = np.int64((mixed ^ (mixed >> np.uint64(29))) & np.uint64(mask))
+        low, high, mixed = min(i, j, k), max(i, j, k), i ^ j ^ k
+        # Faces of neighbouring vertices lie close in the table, which keeps it in the cache.
+        slot = (4 * np.int64(low) + (mixed & 3)) & mask
+        tries = 0
         fresh = True
-        while table[slot] >= 0:
+        while fresh and table[slot] >= 0:
             other = table[slot]
             a, b, c = faces[other, 0], faces[other, 1], faces[other, 2]
-            if min(a, b, c) == low and max(a, b, c) == high and a ^ b ^ c == i ^ j ^ k:
+            if a ^ b ^ c == mixed and min(a, b, c) == low and max(a, b, c) == high:
                 fresh = False
-                break
+            tries += 1
             slot = (slot + 1) & mask
+            if tries == 16:  # a vertex of many faces: go on elsewhere, spread over the table
+                spread = (
+                    np.uint64(low) * np.uint64(0x9E3779B97F4A7C15)
+                    ^ np.uint64(mixed) * np.uint64(0xC2B2AE3D27D4EB4F)
+                    ^ np.uint64(high) * np.uint64(0x165667B19E3779F9)
+                )
+                slot = np.int64((spread ^ (spread >> np.uint64(29))) & np.uint64(mask))
+        keep[face] = fresh
+        copies += not fresh
         if fresh:
             table[slot] = face
-            keep[face] = True
-        else:
-            copies += 1
     return lost, flat, copies
+
+
+@jit(nogil=True)
+def mark_used(faces: Any, used: Any) -> None:
+    """Set `used` (V,) bool, all False, at the vertices of `faces` (F, 3)."""
+    for face in range(len(faces)):
+        for k in range(3):
+            used[faces[face, k]] = True
 
 
 @jit(nogil=True)

@@ -131,7 +131,8 @@ def lattice(dataset: Any, path: Path) -> Float64:
                 remedy="Export it as a GeoTIFF in a projected CRS, or with a world file (.tfw).",
             )
         matrix = _world_file(world)
-    if not np.isfinite(matrix).all() or not abs(np.linalg.det(matrix[:, :2])) > 0:
+    (a, b, _), (d, e, _) = matrix.tolist()
+    if not np.isfinite([*matrix.ravel(), a * e, b * d]).all() or a * e == b * d:
         raise InputError(
             f"has a georeference that flattens its pixels ({matrix.tolist()}).",
             file=path,

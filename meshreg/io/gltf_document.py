@@ -57,6 +57,7 @@ class Document:
     binary: UInt8 | None = None
     rest: tuple[int, int] = (0, 0)
     _loaded: dict[int, UInt8] = field(default_factory=dict, repr=False)
+    _checked: dict[str, list[dict[str, Any]]] = field(default_factory=dict, repr=False)
 
     @property
     def is_binary(self) -> bool:
@@ -69,10 +70,12 @@ class Document:
 
     def items(self, kind: str) -> list[dict[str, Any]]:
         """Return one of the top-level lists, every entry an object; empty where it is missing."""
-        found = self.tree.get(kind, [])
-        if not isinstance(found, list) or not all(isinstance(item, dict) for item in found):
-            self.fail(f"has {kind!r} that is no list of objects.")
-        return found
+        if kind not in self._checked:
+            found = self.tree.get(kind, [])
+            if not isinstance(found, list) or not all(isinstance(item, dict) for item in found):
+                self.fail(f"has {kind!r} that is no list of objects.")
+            self._checked[kind] = found
+        return self._checked[kind]
 
     def item(self, kind: str, index: Any, place: str) -> dict[str, Any]:
         """Return entry `index` of a top-level list."""

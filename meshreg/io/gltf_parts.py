@@ -59,13 +59,9 @@ def read_parts(document: Document, pages: Pages, notes: Notes) -> list[Part]:
     _require_bounded(document, instances)
     parts = []
     for mesh, matrix in instances:
-        primitives = document.items("meshes")[mesh].get("primitives", [])
-        place = f"meshes[{mesh}]"
-        if not isinstance(primitives, list) or not all(isinstance(p, dict) for p in primitives):
-            document.fail("has primitives that are no list of objects.", place)
-        for number, primitive in enumerate(primitives):
+        for number, primitive in enumerate(_primitives(document, mesh)):
             mode = primitive.get("mode", _TRIANGLES)
-            here = f"{place}.primitives[{number}]"
+            here = f"meshes[{mesh}].primitives[{number}]"
             if mode in (_POINTS, _TRIANGLES, _STRIP, _FAN):
                 parts.append(_part(document, primitive, matrix, pages, here))
             elif mode in (1, 2, 3):
@@ -92,12 +88,10 @@ def _require_bounded(document: Document, instances: list[tuple[int, Float64]]) -
     accessors = document.items("accessors")
     total = 0
     for mesh, _ in instances:
-        for primitive in document.items("meshes")[mesh].get("primitives", []):
-            attributes = primitive.get("attributes") if isinstance(primitive, dict) else None
-            for index in (
-                attributes.get("POSITION") if isinstance(attributes, dict) else None,
-                primitive.get("indices") if isinstance(primitive, dict) else None,
-            ):
+        for primitive in _primitives(document, mesh):
+            attributes = primitive.get("attributes")
+            position = attributes.get("POSITION") if isinstance(attributes, dict) else None
+            for index in (position, primitive.get("indices")):
                 if type(index) is int and 0 <= index < len(accessors):
                     count = accessors[index].get("count")
                     total += count if type(count) is int else 0
@@ -108,6 +102,13 @@ def _require_bounded(document: Document, instances: list[tuple[int, Float64]]) -
             file=document.path,
             remedy="Export the survey as one mesh.",
         )
+
+
+def _primitives(document: Document, mesh: int) -> list[dict[str, Any]]:
+    found = document.items("meshes")[mesh].get("primitives")
+    if not isinstance(found, list) or not all(isinstance(item, dict) for item in found):
+        document.fail("has primitives that are no list of objects.", f"meshes[{mesh}]")
+    return found
 
 
 def _part(

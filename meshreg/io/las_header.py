@@ -9,20 +9,19 @@ from __future__ import annotations
 import contextlib
 import os
 import struct
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
 
-from meshreg.errors import InputError, MeshregError
+from meshreg.errors import InputError
 from meshreg.io.crs import crs_text, metres_per_unit, parse_crs, with_vertical_unit
+from meshreg.io.laz_chunks import DAMAGED, Vlr, check_chunks
 from meshreg.io.safe import open_regular, require
 
 _SIZES = {0: 227, 1: 227, 2: 227, 3: 235, 4: 375, 5: 393}  # by minor version
 _RECORDS = (20, 28, 26, 34, 57, 63, 30, 36, 38, 59, 67)  # by point format
-_DAMAGED = "The file is cut off or damaged; export or copy it again."
 _LINEAR_UNITS = {9001: 1.0, 9002: 0.3048, 9003: 1200 / 3937}  # GeoTIFF codes
 _ODD = "Its coordinates were taken as a local frame."
 CRS_RECORDS = (2111, 2112, 34735, 34736, 34737)
@@ -55,10 +54,10 @@ def check_header(path: Path) -> LasHead:
         size = os.fstat(stream.fileno()).st_size
         head = stream.read(393)
         if head[:4] != b"LASF":
-            raise InputError("does not start with 'LASF'.", file=path, remedy=_DAMAGED)
+            raise InputError("does not start with 'LASF'.", file=path, remedy=DAMAGED)
         if len(head) < 227 or head[24] != 1 or head[25] not in _SIZES:
             version = f"{head[24]}.{head[25]}" if len(head) >= 227 else "cut off"
-            raise InputError(f"has an unknown LAS version ({version}).", file=path, remedy=_DAMAGED)
+            raise InputError(f"has an unknown LAS version ({version}).", file=path, remedy=DAMAGED)
         minor = head[25]
         length, start, n_vlrs, form, record = struct.unpack_from("<HIIBH", head, 94)
         if not _SIZES[minor] <= length <= start <= size or len(head) < _SIZES[minor]:
@@ -66,7 +65,7 @@ def check_header(path: Path) -> LasHead:
                 f"has a header of {length} bytes and points from byte {start}, in {size} bytes.",
                 file=path,
                 place="header",
-                remedy=_DAMAGED,
+                remedy=DAMAGED,
             )
         (encoding,) = struct.unpack_from("<H", head, 6)
         compressed, form = bool(form & 0xC0), form & 0x3F
@@ -83,8 +82,9 @@ def check_header(path: Path) -> LasHead:
         if minor >= 4:
             evlrs, n_evlrs, count = struct.unpack_from("<QIQ", head, 235)
             if n_evlrs:
-                end = _walk(stream, path, evlrs, n_evlrs, size, start, extended=True)
-        _walk(stream, path, length, n_vlrs, start, length, extended=False)
+                _walk(stream, path, evlrs, n_evlrs, size, start, extended=True)
+                end = evlrs
+        vlrs = _walk(stream, path, length, n_vlrs, start, length, extended=False)
     inner = bool(encoding & 2) and 0 < waves < size
     if inner and form in (4, 5, 9, 10):
         end = min(end, waves)
@@ -93,6 +93,8 @@ def check_header(path: Path) -> LasHead:
     _check_numbers(path, step, offset)
     if count == 0:
         raise InputError("holds no points.", file=path, remedy="Export it again.")
+    if compressed:
+        check_chunks(path, vlrs, start, size, count, record)
     return LasHead(count, record, form, compressed, step, offset, minor, inner)
 
 
@@ -114,44 +116,29 @@ def _check_numbers(path: Path, step: Any, offset: Any) -> None:
 
 def _walk(
     stream: BinaryIO, path: Path, start: int, count: int, end: int, least: int, *, extended: bool
-) -> int:
-    """Step over all (E)VLRs, each of which must lie before `end`; return where they start."""
+) -> list[Vlr]:
+    """Step over all (E)VLRs, each of which must lie before `end`."""
     what = "EVLRs" if extended else "VLRs"
-    size, where, form = (60, 20, "<Q") if extended else (54, 20, "<H")
+    form = struct.Struct("<H16sHQ32s" if extended else "<H16sHH32s")
     if start < least or start > end:
-        raise InputError(f"has its {what} at byte {start}.", file=path, remedy=_DAMAGED)
-    require(count, size, end - start, path, "header", what)
+        raise InputError(f"has its {what} at byte {start}.", file=path, remedy=DAMAGED)
+    require(count, form.size, end - start, path, "header", what)
+    found = []
     here = start
     for number in range(count):
-        stream.seek(here + where)
-        raw = stream.read(struct.calcsize(form))
-        length = struct.unpack(form, raw)[0] if len(raw) == struct.calcsize(form) else end
-        here += size + length
+        stream.seek(here)
+        raw = stream.read(form.size)
+        _, user, record, length, _ = form.unpack(raw.ljust(form.size, b"\xff"))
+        found.append(Vlr(user.rstrip(b"\0"), record, here + form.size, length))
+        here += form.size + length
         if here > end:
             raise InputError(
                 f"has {count} {what}, of which number {number + 1} runs beyond byte {end}.",
                 file=path,
-                place=f"byte {here - size - length}",
-                remedy=_DAMAGED,
+                place=f"byte {here - form.size - length}",
+                remedy=DAMAGED,
             )
-    return start
-
-
-@contextlib.contextmanager
-def las_errors(path: Path, error_type: type[MeshregError] = InputError) -> Iterator[None]:
-    """Turn whatever laspy, lazrs or a panic of lazrs raises into one error that names the file."""
-    try:
-        yield
-    except (MeshregError, KeyboardInterrupt, SystemExit, GeneratorExit, MemoryError):
-        raise
-    except BaseException as error:  # a Rust panic is no Exception
-        kind, text = type(error).__name__, " ".join(str(error).split())
-        reading = issubclass(error_type, InputError)
-        raise error_type(
-            f"cannot be {'read' if reading else 'written'}: {kind}: {text[:200]}.",
-            file=path,
-            remedy=_DAMAGED if reading else "Free space, or choose another folder.",
-        ) from error
+    return found
 
 
 def file_crs(header: Any, notes: list[str]) -> tuple[str | None, float | None]:

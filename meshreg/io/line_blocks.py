@@ -11,21 +11,22 @@ from pathlib import Path
 from typing import Any, BinaryIO, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from meshreg.errors import InputError
+from meshreg.errors import InputError, ResourceLimitError
+from meshreg.types import UInt8
 
-BLOCK = 1 << 20  # bytes read at once; also the longest line
-PADDING = b"\n\n\n\n"
+BLOCK = 1 << 19  # bytes read at once
+LONGEST = 1 << 20  # bytes in a line, its continuation included
+PADDING = 4  # line ends behind a block
 _MAX_THREADS = 4
 _Result = TypeVar("_Result")
 
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """Whole lines of a file: `data[:end]`, then `PADDING`; at most 2 * BLOCK bytes."""
+    """Whole lines of a file: `data[:end]`, at most BLOCK + LONGEST, then `PADDING` line ends."""
 
-    data: NDArray[np.uint8]
+    data: UInt8
     end: int
 
 
@@ -46,6 +47,8 @@ def line_blocks(stream: BinaryIO, path: Path, hasher: Any = None) -> Iterator[Bl
     ------
     InputError
         UTF-16, a NUL byte, an empty file.
+    ResourceLimitError
+        A line longer than `LONGEST`.
     """
     head = stream.read(3)
     if not head:
@@ -54,48 +57,52 @@ def line_blocks(stream: BinaryIO, path: Path, hasher: Any = None) -> Iterator[Bl
         raise InputError("is UTF-16 text.", file=path, remedy="Save it as UTF-8.")
     if hasher is not None:
         hasher.update(head)
-    carry = b"" if head == b"\xef\xbb\xbf" else head
+    carry = np.frombuffer(b"" if head == b"\xef\xbb\xbf" else head, np.uint8)
     place = len(head) - len(carry)  # of the carry's first byte in the file
     n_read = -1
     while n_read:
-        buffer = bytearray(len(carry) + BLOCK + len(PADDING))
+        buffer = np.empty(len(carry) + BLOCK + PADDING, np.uint8)
         buffer[: len(carry)] = carry
-        new = memoryview(buffer)[len(carry) : len(carry) + BLOCK]
-        n_read = stream.readinto(new)  # type: ignore[attr-defined]
+        new = buffer[len(carry) : len(carry) + BLOCK]
+        n_read = stream.readinto(new.data)  # type: ignore[attr-defined]
         if hasher is not None:
-            hasher.update(new[:n_read])
+            hasher.update(new[:n_read].data)
         size = len(carry) + n_read
-        nul = buffer.find(b"\0", 0, size)
-        if nul >= 0:
+        if size and buffer[:size].min() == 0:
             raise InputError(
                 "holds a NUL byte: it is no text, or damaged.",
                 file=path,
-                place=f"byte {place + nul}",
+                place=f"byte {place + int(buffer[:size].argmin())}",
                 remedy="Export or copy it again.",
             )
-        end = _last_line_end(buffer, size) if n_read else size
-        if end == 0 and size >= BLOCK:
-            end = size  # a line too long to be one; who reads it says which
-        carry = bytes(memoryview(buffer)[end:size])
+        end = _last_line_end(buffer[:size]) if n_read else size
+        if end == 0 and size > LONGEST:
+            raise ResourceLimitError(
+                f"a line is longer than {LONGEST} bytes.", file=path, place=f"from byte {place}"
+            )
+        carry = buffer[end:size].copy()
         place += end
         if end:
-            buffer[end : end + len(PADDING)] = PADDING
-            yield Block(np.frombuffer(buffer, np.uint8), end)
+            buffer[end : end + PADDING] = 10
+            yield Block(buffer, end)
 
 
-def _last_line_end(buffer: bytearray, size: int) -> int:
+def _last_line_end(data: UInt8) -> int:
     """Return the place behind the last line that is whole, 0 if there is none."""
-    end = size
-    while end > 0:
-        newline, carriage = buffer.rfind(b"\n", 0, end), buffer.rfind(b"\r", 0, end)
-        last = max(newline, carriage)
-        # A carriage return at the very end may be half of a CRLF.
-        split = last == carriage and last == size - 1
-        before = last - (2 if last == newline and carriage == last - 1 else 1)
-        hidden = before >= 0 and buffer[before] == ord("\\")
-        if not split and not hidden:
-            return last + 1
-        end = last
+    for length in (4096, len(data)):  # nearly always it is close to the end
+        tail = data[-length:].tobytes()
+        end = len(tail)
+        while end > 0:
+            newline, carriage = tail.rfind(b"\n", 0, end), tail.rfind(b"\r", 0, end)
+            last = max(newline, carriage)
+            # A carriage return at the very end may be half of a CRLF.
+            split = last == carriage and last == len(tail) - 1
+            before = last - (2 if last == newline and carriage == last - 1 else 1)
+            hidden = before >= 0 and tail[before] == ord("\\")
+            sure = last > 1 or len(tail) == len(data)
+            if last >= 0 and sure and not split and not hidden:
+                return len(data) - len(tail) + last + 1
+            end = last
     return 0
 
 
@@ -108,7 +115,7 @@ def in_order(
     (`n_bytes`) are worked on at once.
     """
     threads = min(_MAX_THREADS, os.cpu_count() or 1)
-    if threads == 1 or n_bytes <= 2 * BLOCK:
+    if threads == 1 or n_bytes <= 4 * BLOCK:
         for block in blocks:
             yield block, work(block)
         return

@@ -6,8 +6,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from meshreg.errors import InputError, ResourceLimitError
-from meshreg.io.line_blocks import BLOCK, line_blocks
+from meshreg.errors import InputError
+from meshreg.io.line_blocks import line_blocks
 from meshreg.io.safe import decode_name, open_regular
 
 _OTHER_MAPS = ("bump", "disp", "decal", "refl", "norm")
@@ -93,9 +93,6 @@ def _lines(path: Path) -> Iterator[tuple[int, bytes]]:
         for block in line_blocks(stream, path):
             for line in block.data[: block.end].tobytes().splitlines():
                 number += 1
-                if len(line) > BLOCK:
-                    text = f"the line is longer than {BLOCK} bytes."
-                    raise ResourceLimitError(text, file=path, place=f"line {number}")
                 yield number, line
 
 

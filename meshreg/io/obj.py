@@ -58,28 +58,35 @@ def read(path: Path, options: ReadOptions) -> Survey:
     if not len(found.points):
         raise InputError("holds no vertices.", file=path, remedy="Is it a Wavefront OBJ file?")
     notes = _notes(found)
+    raw, companions = _geometry(path, found, options, notes)
+    counts = {**found.counts, "triangles": 0 if raw.faces is None else len(raw.faces)}
+    about = Found("obj", tuple(notes), companions, counts, sha256=found.sha256)
+    del found  # what is left of it takes as much memory as the result
+    return assemble_survey(path, raw, about, options)
+
+
+def _geometry(
+    path: Path, found: Scan, options: ReadOptions, notes: list[str]
+) -> tuple[RawGeometry, tuple[Path, ...]]:
+    """Return points, triangles and texture, and the files that were referred to."""
     colors = _colors(found, notes)
     _require_range(path, found, found.vertex, 0, len(found.points), "vertex")
-    raw = RawGeometry(found.points, colors=colors)
-    companions: tuple[Path, ...] = ()
-    if len(found.vertex):
-        triangles = _triangles(path, found)
-        notes += triangles.notes()
-        faces = np.ascontiguousarray(triangles.pick_corners(found.vertex), np.int32)
-        drape = _Drape(path, options)
-        if not options.geometry_only:
-            drape.open(found)
-        uv, pages = drape.lay(found, triangles)
-        notes += drape.notes[:_MOST_NOTES]
-        if len(drape.notes) > _MOST_NOTES:
-            notes.append(f"{len(drape.notes) - _MOST_NOTES} more notes on materials were left out.")
-        companions = drape.companions
-        raw = RawGeometry(found.points, faces, colors, uv, pages, tuple(drape.textures))
-    elif len(found.uvs) or found.materials:
-        notes.append("The file holds texture coordinates or materials but no faces: is it cut off?")
-    counts = {**found.counts, "triangles": 0 if raw.faces is None else len(raw.faces)}
-    about = Found("obj", tuple(notes), companions, counts)
-    return assemble_survey(path, raw, about, options)
+    if not len(found.vertex):
+        if len(found.uvs) or found.materials:
+            notes.append("There are texture coordinates or materials, but no faces: cut off?")
+        return RawGeometry(found.points, colors=colors), ()
+    triangles = _triangles(path, found)
+    notes += triangles.notes()
+    faces = np.ascontiguousarray(triangles.pick_corners(found.vertex), np.int32)
+    drape = _Drape(path, options)
+    if not options.geometry_only:
+        drape.open(found)
+    uv, pages = drape.lay(found, triangles)
+    notes += drape.notes[:_MOST_NOTES]
+    if len(drape.notes) > _MOST_NOTES:
+        notes.append(f"{len(drape.notes) - _MOST_NOTES} more notes on materials were left out.")
+    raw = RawGeometry(found.points, faces, colors, uv, pages, tuple(drape.textures))
+    return raw, drape.companions
 
 
 def _notes(found: Scan) -> list[str]:

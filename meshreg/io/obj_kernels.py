@@ -280,10 +280,8 @@ def parse(
             # A comment is never continued: one that ends in a backslash would eat a vertex.
             joins = data[place] != _HASH
             here = place if behind else skip_line(data, place, joins, state)
-            if here - start > MAX_LINE + 2 and state[LINES] == lines + 1:
+            if here - start > MAX_LINE + 2:
                 place, error = start, LONG_LINE
-        elif skip_line(data, start, False, state) - start > MAX_LINE + 2:
-            place, error = start, LONG_LINE  # what else is wrong may come of cutting it
         if error != OK:
             state[ERROR], state[ERROR_AT], state[LINES] = error, place, lines
             return end

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from meshreg.io.line_blocks import BLOCK, Block
+from meshreg.io.line_blocks import BLOCK, LONGEST, Block
 from meshreg.io.safe import decode_name
 from meshreg.types import Float32, Float64, Int32
 
@@ -48,7 +48,7 @@ class Worker:
         try:
             scratch = self._scratch.pop()
         except IndexError:
-            scratch = _new_scratch(2 * BLOCK)
+            scratch = _new_scratch(BLOCK + LONGEST)
         floats, faces, events = scratch
         state = np.zeros(text.N_STATE, np.int64)
         here = 0

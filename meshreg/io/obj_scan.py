@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from meshreg.errors import InputError, ResourceLimitError
-from meshreg.io.line_blocks import BLOCK, Block, in_order, line_blocks
+from meshreg.io.line_blocks import LONGEST, Block, in_order, line_blocks
 from meshreg.io.obj_lines import Lines, Worker, word_at
 from meshreg.io.safe import open_regular
 from meshreg.types import Float32, Float64, Int32
@@ -158,7 +158,7 @@ class _Joiner:
         code = int(state[text.ERROR])
         place = f"line {self._totals[text.LINES] + state[text.LINES] + 1}"
         if code == text.LONG_LINE:
-            message = f"the line is longer than {BLOCK} bytes."
+            message = f"the line is longer than {LONGEST} bytes."
             return ResourceLimitError(message, file=self._path, place=place)
         word = word_at(block, int(state[text.ERROR_AT]))
         if code not in (text.FEW_NUMBERS, text.MANY_NUMBERS):

@@ -22,7 +22,7 @@ from meshreg.types import Float64, Frame, Mesh, PointCloud, SourceFile, Survey, 
 
 _ROWS = 1 << 16  # rows turned into text at once
 _FEWEST_DECIMALS = 6
-_UV_DECIMALS = 8  # float32 between 0.5 and 1 steps by 6e-8
+_UV_DECIMALS = 9  # float32 between 0.5 and 1 steps by 6e-8, near 0.01 by 9e-10
 _BOM = b"\xef\xbb\xbf"
 
 
@@ -206,6 +206,7 @@ def _mover_of_blocks(move: Mover, path: Path) -> Callable[[Block], tuple[UInt8, 
         values[kinds == 0] = points
         normals = values[kinds == 1]
         values[kinds == 1] = move.directions(np.zeros_like(normals), normals)
+        values[~np.isfinite(values).all(axis=1)] = np.nan  # those lines stay as they are
         decimals = np.maximum(decimals, _FEWEST_DECIMALS)
         out = np.empty(block.end + 3 * n * kernels.MAX_NUMBER, np.uint8)
         size = kernels.put_vectors(block.data, block.end, spans, values, decimals, out)

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from meshreg.errors import InputError
+from meshreg.errors import InputError, ResourceLimitError
 from meshreg.io.assemble import (
     Found,
     RawGeometry,
@@ -61,7 +61,7 @@ def read(path: Path, options: ReadOptions) -> Survey:
     UnsafeReferenceError
         A `comment TextureFile` that leads out of the file's folder.
     ResourceLimitError
-        A texture page of more than `options.max_pixels`.
+        A texture page of more than `options.max_pixels`, or 2^31 vertices.
     """
     header = read_header(path)
     vertex = header.element("vertex")
@@ -72,6 +72,12 @@ def read(path: Path, options: ReadOptions) -> Survey:
     if header.element("tristrips") is not None:
         raise InputError(
             "holds triangle strips.", file=path, remedy="Export it with triangles as faces."
+        )
+    if vertex.count >= 2**31:
+        raise ResourceLimitError(
+            f"has {vertex.count} vertices; fewer than 2^31 are read.",
+            file=path,
+            remedy="Cut it into blocks.",
         )
     tables = read_tables(header, file_bytes(path), path, ("vertex", "face"))
     notes: list[str] = []

@@ -13,6 +13,7 @@ from meshreg.errors import InputError
 from meshreg.io.safe import open_regular, require
 
 MAX_HEADER = 1 << 20
+_MAX_LINES = 5000  # of elements and properties
 _DAMAGED = "The file is damaged or no PLY file; export or copy it again."
 _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _TYPES = {
@@ -160,7 +161,11 @@ def _split(start: bytes, path: Path) -> list[bytes]:
             place=f"byte {len(start)}",
             remedy=_DAMAGED,
         )
-    return [*re.findall(rb"[^\r\n]*(?:\r\n|\n|\r)", start[: last.start(1)]), last[1]]
+    lines = re.findall(rb"[^\r\n]*(?:\r\n|\n|\r)", start[: last.start(1)])
+    declared = sum(line.lstrip()[:8] in (b"element ", b"property") for line in lines)
+    if declared > _MAX_LINES:
+        raise _bad(f"declares {declared} elements and properties", path, "header")
+    return [*lines, last[1]]
 
 
 def _count(text: str, name: str, path: Path, place: str) -> int:

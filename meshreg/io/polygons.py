@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from meshreg.errors import InputError
 
 _BENT = 0.05  # a concave polygon further from its plane than this share of its size is "not flat"
-_MAX_CONCAVE = 5000  # corners; ear clipping takes quadratic time
+_MAX_CONCAVE = 2000  # corners; ear clipping takes quadratic time
 
 Int64 = NDArray[np.int64]
 Int32 = NDArray[np.int32]
@@ -103,7 +103,7 @@ def triangulate(
     Raises
     ------
     InputError
-        A concave polygon of more than 5,000 corners.
+        A concave polygon of more than 2,000 corners.
     """
     sizes = np.asarray(sizes, np.int64)
     first = np.cumsum(sizes) - sizes

@@ -6,18 +6,17 @@ registered maps. A moved raster is always sampled anew; editing its header could
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from meshreg.errors import InputError, ResourceLimitError
 from meshreg.types import Bool, Float32, Float64, Grid, UInt8
 
 Forward = Callable[[Float64], Float64]
 _STEP = 32  # cells between nodes at which the map is solved exactly
-_ROWS = 1 << 20  # cells sampled at once
 MAX_CELLS = 2_000_000_000
 
 
@@ -109,34 +108,46 @@ def regrid(
     values : (H', W') or (H', W', C), as `values`; heights absolute, NaN where not valid
     valid : (H', W') bool
     """
-    source = _Source(placed, grid)
-    rows, cols = grid.shape
-    out = np.zeros((rows, cols, *values.shape[2:]), values.dtype)
-    seen = np.zeros((rows, cols), bool)
-    tilted = surface is not None and source.tilts(surface[0])
-    for part in _row_blocks(rows, cols):
-        x, y, up = source.at(part)
-        height = np.full_like(x, placed.level)
-        if tilted and surface is not None:
-            for _ in range(3):  # a contraction by tilt times slope
-                dx, dy = np.multiply.outer(source.lean, height - placed.level)
-                sampled, known = _sample(
-                    surface[0], np.isfinite(surface[0]), surface[1], x + dx, y + dy
-                )
-                height = np.where(known, sampled, height)
-            dx, dy = np.multiply.outer(source.lean, height - placed.level)
-            x, y = x + dx, y + dy
-        part_values, seen[part] = _sample(values, valid, placed, x, y)
-        if is_height:
-            part_values = up + source.gain * (part_values - placed.level)
-            part_values[~seen[part]] = np.nan
-        elif out.dtype == np.uint8:
-            part_values = np.rint(part_values)
-        out[part] = part_values
+    from meshreg.io import regrid_kernels
+
+    source = Source(placed, grid)
+    out = np.zeros((*grid.shape, *values.shape[2:]), values.dtype)
+    seen = np.zeros(grid.shape, bool)
+    ground, lattice = np.zeros((0, 0), np.float32), placed
+    if surface is not None and source.tilts(surface[0]):
+        ground, lattice = surface
+    regrid_kernels.resample(
+        _fixed(values.reshape(*valid.shape, -1)),
+        _fixed(valid),
+        _back(placed.matrix),
+        source.nodes,
+        source.step,
+        _fixed(ground[..., None]),
+        _fixed(np.isfinite(ground)),
+        _back(lattice.matrix),
+        source.lean,
+        source.gain,
+        placed.level,
+        is_height,
+        out.reshape(*grid.shape, -1),
+        seen,
+    )
     return out, seen
 
 
-class _Source:
+def _fixed(array: Any) -> Any:
+    """Return a contiguous read-only view, so that the kernel is compiled once and not for both."""
+    array = np.ascontiguousarray(array).view()
+    array.flags.writeable = False
+    return array
+
+
+def _back(matrix: Float64) -> Float64:
+    """Return the (2, 3) inverse of a (2, 3) affine matrix."""
+    return np.asarray(np.linalg.inv(np.vstack([matrix, [0.0, 0.0, 1.0]]))[:2])
+
+
+class Source:
     """Where the cells of a grid come from: exact at nodes, bilinear between them.
 
     At a cell, file coordinates are ``(x, y) + lean * (z - level)`` and the new height is
@@ -195,46 +206,3 @@ class _Source:
         row, col = (self.step * (np.arange(n) + 0.5) for n in middle.shape[:2])
         exact = self._solve(*np.meshgrid(row, col, indexing="ij"))
         return float(np.abs(exact - middle)[..., :2].max())
-
-    def at(self, rows: slice) -> tuple[Float64, Float64, Float64]:
-        """Return file x, y and absolute up at `level` of a block of whole rows."""
-        row = np.arange(rows.start, rows.stop) / self.step
-        col = np.arange(self.grid.shape[1]) / self.step
-        upper, left = row.astype(int), col.astype(int)
-        down, right = (row - upper)[:, None, None], (col - left)[None, :, None]
-        band = self.nodes[upper] * (1 - down) + self.nodes[upper + 1] * down
-        x, y, up = np.moveaxis(band[:, left] * (1 - right) + band[:, left + 1] * right, 2, 0)
-        return x, y, up
-
-
-def _row_blocks(rows: int, cols: int) -> Iterator[slice]:
-    step = max(1, _ROWS // cols)
-    for start in range(0, rows, step):
-        yield slice(start, min(start + step, rows))
-
-
-def _sample(
-    values: NDArray[np.float32] | UInt8, valid: Bool, placed: Placed, x: Float64, y: Float64
-) -> tuple[Float64, Bool]:
-    """Return bilinear values at file positions and whether the pixel there is valid."""
-    rows, cols = valid.shape
-    back = np.linalg.inv(placed.matrix[:, :2])
-    col, row = np.tensordot(back, np.stack([x, y]) - placed.matrix[:, 2, None, None], 1) - 0.5
-    near_row, near_col = np.rint(row), np.rint(col)
-    inside = (near_row >= 0) & (near_row < rows) & (near_col >= 0) & (near_col < cols)
-    ok = np.zeros(x.shape, bool)
-    ok[inside] = valid[near_row[inside].astype(int), near_col[inside].astype(int)]
-    row, col = row[ok], col[ok]
-    top, left = np.floor(row).astype(int), np.floor(col).astype(int)
-    total = np.zeros((len(row), *values.shape[2:]))
-    weight = np.zeros(len(row))
-    for down in (0, 1):
-        for right in (0, 1):
-            r, c = np.clip(top + down, 0, rows - 1), np.clip(left + right, 0, cols - 1)
-            share = np.abs(1 - down - (row - top)) * np.abs(1 - right - (col - left)) * valid[r, c]
-            weight += share
-            value = np.where(share > 0, values[r, c].T, 0).T  # NaN times nothing is nothing
-            total += (share * value.T).T
-    out = np.zeros((*x.shape, *values.shape[2:]))
-    out[ok] = (total.T / weight).T
-    return out, ok

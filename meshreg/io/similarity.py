@@ -48,15 +48,18 @@ class Similarity:
 
 
 def turn_up(up: Float64) -> Float64:
-    """Return the (3, 3) rotation of least angle that takes the direction `up` to z."""
+    """Return the (3, 3) rotation that takes the direction `up` to z: the one of least angle.
+
+    A direction that points down is turned over about x first. Models often look along +z with y
+    downward, as their first camera did; its picture's upper edge then comes to lie in the north.
+    """
     up = up / np.linalg.norm(up)
-    z = np.array([0.0, 0.0, 1.0])
-    cosine = float(up @ z)
-    if cosine < -1 + 1e-12:
-        return np.diag([1.0, -1.0, -1.0])
-    v = np.cross(up, z)
+    if up[2] < 0:
+        over = np.diag([1.0, -1.0, -1.0])
+        return turn_up(over @ up) @ over
+    v = np.cross(up, [0.0, 0.0, 1.0])
     cross = np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
-    return np.asarray(np.eye(3) + cross + cross @ cross / (1 + cosine))
+    return np.asarray(np.eye(3) + cross + cross @ cross / (1 + up[2]))
 
 
 def ground_up(points: Float64, camera_up: Float64) -> Float64:

@@ -95,6 +95,8 @@ def rewrite(source: SourceFile, move: Mover, path: Path) -> tuple[Path, ...]:
     slot = {column: number for number, column in enumerate(wanted_columns(layout))}
     points = values[:, [slot[layout.where[name]] for name in _XYZ]]
     moved = moved_points(move, points)
+    lost = ~np.isfinite(points).all(axis=1)
+    moved[lost] = np.nan  # such rows stay word for word
     flip = layout.down and source.frame.axes[2, 2] < 0 and move.frame.axes[2, 2] > 0
     if flip:
         moved[:, 2] *= -1
@@ -111,6 +113,7 @@ def rewrite(source: SourceFile, move: Mover, path: Path) -> tuple[Path, ...]:
     if set(_NORMAL) <= layout.where.keys():
         vectors = values[:, [slot[layout.where[name]] for name in _NORMAL]]
         turned = move.directions(points, vectors)
+        turned[lost] = np.nan
         if flip:
             turned[:, 2] *= -1
         replacing |= {layout.where[name]: turned[:, k] for k, name in enumerate(_NORMAL)}

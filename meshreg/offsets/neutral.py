@@ -9,50 +9,114 @@ same texture, same holes, no true match.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
 
 from meshreg.offsets.channels import grey, high_pass, local_normalised, orientation
-from meshreg.offsets.correlate import Correlator, Window, overlap_floor
+from meshreg.offsets.correlate import Complex, Correlator, overlap_floor
 from meshreg.offsets.surface import MAD_TO_SIGMA
 from meshreg.types import Bool, Float64, Grid, SurveyRaster
 
 Channel = Literal["terrain", "image"]
+Kind = Literal["scalar", "vector", "director"]
+Parts = tuple[Float64, ...]
 
 
 @dataclass(frozen=True)
-class Field:
-    """Components that are correlated together, zero outside `mask`."""
+class Fields:
+    """A channel's change-resistant fields of one raster, zero outside their common mask.
 
-    name: str
-    parts: tuple[Float64, ...]
+    `parts` holds for each field the components that are correlated together; `kinds` how they
+    turn with the raster: a scalar, a vector (d/drow, d/dcol), or a director (doubled angle).
+    """
+
     mask: Bool
+    parts: tuple[Parts, ...]
+    kinds: tuple[Kind, ...]
+
+    def mapped(self, change: Callable[[Any], Any]) -> Fields:
+        """Return the same fields with `change` applied to every array."""
+        parts = tuple(tuple(change(p) for p in field) for field in self.parts)
+        return Fields(change(self.mask), parts, self.kinds)
+
+    def turned(self, turn: int, flip: bool) -> Fields:
+        """Return the fields that the raster would have, turned by quarter turns, then flipped."""
+        kinds, parts = self.kinds, self.parts
+        for _ in range(turn % 4):
+            parts = tuple(_quarter_turn(k, p) for k, p in zip(kinds, parts, strict=True))
+        if flip:
+            parts = tuple(_flipped(k, p) for k, p in zip(kinds, parts, strict=True))
+
+        def moved(array: Any) -> Any:
+            array = np.rot90(array, turn)
+            return np.ascontiguousarray(np.fliplr(array) if flip else array)
+
+        return Fields(self.mask, parts, kinds).mapped(moved)
 
 
-def fields(raster: SurveyRaster, channel: Channel) -> list[Field]:
-    """Change-resistant fields of one raster."""
+def _quarter_turn(kind: Kind, parts: Parts) -> Parts:
+    if kind == "scalar":
+        return parts
+    first, second = parts
+    return (-second, first) if kind == "vector" else (-first, -second)
+
+
+def _flipped(kind: Kind, parts: Parts) -> Parts:
+    return parts if kind == "scalar" else (parts[0], -parts[1])
+
+
+def fields(raster: SurveyRaster, channel: Channel) -> Fields:
+    """Reduce a raster to its change-resistant fields: height or grey, and its slope's direction."""
+    kinds: tuple[Kind, ...]
     if channel == "terrain":
         mask = raster.valid
         height = raster.height.astype(np.float64)
         height = np.where(mask, height - (np.median(height[mask]) if mask.any() else 0.0), 0.0)
-        fine = Field("height above 2 cells' mean", (high_pass(height, mask, 2.0),), mask)
-        coarse = Field("height above 5 cells' mean", (high_pass(height, mask, 5.0),), mask)
-        slope = Field("slope direction", *orientation(height, mask, 1.0, signed=True))
-        return [fine, coarse, slope]
-    mask = raster.color_valid
-    image = grey(raster)
-    level = Field("grey", (np.clip(local_normalised(image, mask, 6.0), -3, 3),), mask)
-    signed = Field("edge direction", *orientation(image, mask, 1.0, signed=True))
-    unsigned = Field("edge direction, either sign", *orientation(image, mask, 1.0, signed=False))
-    coarse = Field("coarse edges, either sign", *orientation(image, mask, 3.0, signed=False))
-    return [level, signed, unsigned, coarse]
+        slope, inner = orientation(height, mask, 1.0, signed=True)
+        parts: list[Parts] = [
+            (high_pass(height, mask, 2.0),),
+            (high_pass(height, mask, 5.0),),
+            slope,
+        ]
+        kinds = ("scalar", "scalar", "vector")
+    else:
+        mask, image = raster.color_valid, grey(raster)
+        # bleached coral is bright where it was dark: signed edges are sharp, unsigned survive
+        coarse, inner = orientation(image, mask, 3.0, signed=False)
+        parts = [
+            (np.clip(local_normalised(image, mask, 6.0), -3, 3),),
+            orientation(image, mask, 1.0, signed=True)[0],
+            orientation(image, mask, 1.0, signed=False)[0],
+            coarse,
+        ]
+        kinds = ("scalar", "vector", "director", "director")
+    kept = tuple(tuple(np.where(inner, p, 0.0) for p in field) for field in parts)
+    return Fields(inner, kept, kinds)
+
+
+@dataclass(frozen=True)
+class Spectra:
+    """Forward transforms of a raster's fields, made once for many windows of one shape."""
+
+    mask: Complex
+    parts: tuple[tuple[Complex, ...], ...]
+    powers: tuple[Complex, ...]
+
+
+def spectra(of: Fields, correlator: Correlator) -> Spectra:
+    """Transform a raster's fields."""
+    return Spectra(
+        correlator.transform(of.mask),
+        tuple(tuple(correlator.transform(p) for p in field) for field in of.parts),
+        tuple(correlator.transform(sum(p**2 for p in field)) for field in of.parts),
+    )
 
 
 def surface(
-    first: Sequence[Field], second: Sequence[Field], window: Window, min_overlap: float
+    first: Spectra, second: Spectra, correlator: Correlator, min_overlap: float
 ) -> tuple[Float64, Float64]:
     """Evidence for each offset, in deviations of what chance does, and the overlap's cells.
 
@@ -62,41 +126,20 @@ def surface(
         NaN where the overlap is too small.
     counts : (K, L) float64
     """
-    correlator = Correlator(window)
-    counts = np.zeros((len(window.rows), len(window.cols)))
-    total = np.zeros_like(counts)
-    scored = np.ones(counts.shape, bool)
-    for a, b in zip(first, second, strict=True):
-        mask1, mask2 = correlator.transform(a.mask), correlator.transform(b.mask)
-        n = correlator.counts(mask1, mask2)
-        scored &= overlap_floor(n, min_overlap)
-        pairs = [
-            (correlator.transform(p), correlator.transform(q))
-            for p, q in zip(a.parts, b.parts, strict=True)
-        ]
-        cross = correlator.sums(*pairs)
-        power1 = correlator.sums((correlator.transform(_power(a)), mask2))
-        power2 = correlator.sums((mask1, correlator.transform(_power(b))))
-        power = np.sqrt(np.maximum(power1, 0) * np.maximum(power2, 0))
-        usable = scored & (power > 1e-12 * np.maximum(n, 1))
-        z = np.divide(cross, power, out=np.zeros_like(cross), where=usable) * np.sqrt(n)
+    counts = correlator.counts(first.mask, second.mask)
+    scored = overlap_floor(counts, min_overlap)
+    total = np.zeros(counts.shape)
+    for a, b, power_a, power_b in zip(
+        first.parts, second.parts, first.powers, second.powers, strict=True
+    ):
+        cross = correlator.sums(*zip(a, b, strict=True))
+        power = np.maximum(correlator.sums((power_a, second.mask)), 0)
+        power = np.sqrt(power * np.maximum(correlator.sums((first.mask, power_b)), 0))
+        usable = scored & (power > 1e-6 * np.maximum(power.max(), 1e-300))
+        z = np.divide(cross, power, out=np.zeros_like(cross), where=usable) * np.sqrt(counts)
         total += _in_deviations(z, usable)
-        counts = np.maximum(counts, n)
     evidence = _in_deviations(total, scored)
     return np.where(scored, evidence, np.nan), counts
-
-
-def mirrored(field: Field, turn: int, flip: bool) -> Field:
-    """Return the field turned by quarter turns and flipped: same texture, another place.
-
-    Components that are directions need no turning along: under chance their sign is arbitrary.
-    """
-
-    def turned(array: Any) -> Any:
-        array = np.rot90(array, turn)
-        return np.ascontiguousarray(np.fliplr(array) if flip else array)
-
-    return Field(field.name, tuple(turned(p) for p in field.parts), turned(field.mask))
 
 
 def turned_grid(grid: Grid, turn: int) -> Grid:
@@ -112,10 +155,6 @@ def turned_grid(grid: Grid, turn: int) -> Grid:
         (cols, rows),
         grid.crs,
     )
-
-
-def _power(field: Field) -> Float64:
-    return np.asarray(sum(part**2 for part in field.parts))
 
 
 def _in_deviations(values: Float64, use: Any) -> Float64:

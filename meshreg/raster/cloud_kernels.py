@@ -31,10 +31,11 @@ def cells_of(points: Float64, keep: Bool, cell: float, shape: tuple[int, int]) -
             out[i] = -1
             if not math.isfinite(x + y + points[i, 2]):
                 broken[chunk] += 1
-            elif (keep.size == 0 or keep[i]) and -1e-6 <= x <= cols + 1e-6:
-                if -1e-6 <= y <= rows + 1e-6:
-                    row, col = min(int(max(y, 0.0)), rows - 1), min(int(max(x, 0.0)), cols - 1)
-                    out[i] = row * cols + col
+                continue
+            inside = -1e-6 <= x <= cols + 1e-6 and -1e-6 <= y <= rows + 1e-6
+            if inside and (keep.size == 0 or keep[i]):
+                row, col = min(int(max(y, 0.0)), rows - 1), min(int(max(x, 0.0)), cols - 1)
+                out[i] = row * cols + col
     return out, broken.sum()
 
 

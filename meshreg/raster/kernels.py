@@ -89,7 +89,9 @@ def face_bands(
                 continue
             low, high = min(ay, by, cy), max(ay, by, cy)
             west, east = min(ax, bx, cx), max(ax, bx, cx)
-            if low >= 0.0 and high <= bottom and west >= 0.0 and east <= right:
+            # Whole numbers are centres: the lattice's edges lie half a sample further out.
+            inside_rows = low >= -0.5 - 1e-6 and high <= bottom + 0.5 + 1e-6
+            if inside_rows and west >= -0.5 - 1e-6 and east <= right + 0.5 + 1e-6:
                 sums[chunk, 1] += 0.5 * abs(area)
             first = math.ceil(max(low, 0.0))
             last = math.floor(min(high, float(bottom)))

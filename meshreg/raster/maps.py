@@ -38,7 +38,7 @@ def draw_maps(maps: Maps, placing: Placing, grid: Grid) -> Layers:
     kernels.resampled_heights(maps.height, back, times, height)
     layers.height[:] = placing.linear[2, 2] * height + placing.shift[2]
     layers.samples[np.isfinite(height)] = min(times * times, 65535)
-    if maps.color is not None and maps.color_grid is not None:
+    if maps.color is not None and maps.color_valid is not None and maps.color_grid is not None:
         times, back = _back(placing, grid, maps.color_grid)
         kernels.resampled_colors(
             maps.color, maps.color_valid, back, times, layers.color, layers.color_valid
@@ -47,7 +47,7 @@ def draw_maps(maps: Maps, placing: Placing, grid: Grid) -> Layers:
 
 
 def _back(placing: Placing, grid: Grid, source: Grid) -> tuple[int, Float64]:
-    """Samples along a cell's side, and (2, 3) from their column and row to the source's."""
+    """Count the samples along a cell's side; find (2, 3) from their places to the source's."""
     ratio = grid.cell / (source.cell * placing.scale)
     times = max(1, math.ceil(ratio - 1e-6))
     linear = placing.linear[:2, :2]

@@ -22,7 +22,7 @@ def _corner(place: float, size: int) -> tuple[int, int, float]:
     # What is off a centre by less than a millionth is rounding: keep the cell's very value.
     if abs(place - round(place)) < 1e-6:
         place = float(round(place))
-    first = int(math.floor(place))
+    first = math.floor(place)
     return first, min(first + 1, size - 1), place - first
 
 

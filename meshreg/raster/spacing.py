@@ -1,4 +1,4 @@
-"""How far apart a survey's points and texels are on the ground."""
+"""What a survey measures: where it lies, how far apart its points and texels are."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from meshreg.errors import InputError
-from meshreg.types import Float64, Maps, Mesh, PointCloud, Survey
+from meshreg.types import Float64, Maps, Mesh, PointCloud, Survey, Transform
 
 _SAMPLE = 200_000  # faces or points looked at; every n-th, so that the answer is repeatable
 
@@ -83,10 +83,10 @@ def texel_sizes(mesh: Mesh) -> tuple[Float64, Float64, Float64]:
         return np.empty(0), np.empty(0), np.empty(0)
     step = max(1, len(mesh.faces) // _SAMPLE)
     faces, uv, page = mesh.faces[::step], mesh.uv[::step], mesh.face_texture[::step]
-    faces, uv, page = faces[page >= 0], uv[page >= 0].astype(np.float64), page[page >= 0]
+    faces, uv, page = faces[page >= 0], uv[page >= 0], page[page >= 0]
     pixels = np.array([texture.size for texture in mesh.textures], float).reshape(-1, 2)
     ground = _area(mesh.vertices[faces][:, :, :2])
-    texels = _area(uv) * pixels[page].prod(axis=1)
+    texels = _area(uv.astype(np.float64)) * pixels[page].prod(axis=1)
     # A face that no camera saw often has all corners on one texel: it tells nothing.
     told = np.isfinite(ground * texels) & (ground > 0) & (texels > 1e-3)
     texel = np.sqrt(ground[told] / texels[told])
@@ -125,3 +125,72 @@ def _cloud_spacing(points: Float64) -> float | None:
         area = len(np.unique(cells[:, 1] * cols + cells[:, 0])) * square**2
         square = 5.0 * np.sqrt(area / len(sample))
     return float(np.sqrt(area / len(points)))
+
+
+def survey_bounds(survey: Survey, transform: Transform | None = None) -> Float64:
+    """(2, 3) float64: lowest and highest absolute east, north, up [m] after `transform`.
+
+    Points that are not finite, and vertices in no face, do not count.
+
+    Raises
+    ------
+    InputError
+        If nothing is left to bound.
+    """
+    geometry = survey.geometry
+    if isinstance(geometry, Maps):
+        points = _map_corners(geometry)
+    else:
+        points = geometry.points
+        if isinstance(geometry, Mesh):
+            used = np.zeros(len(points), bool)
+            used[geometry.faces.ravel()] = True
+            points = points if used.all() else points[used]
+        if transform is None:  # one pass without a copy: NaN is skipped, infinity found below
+            low, high = _finite_bounds(points)
+            return _checked_bounds(survey, np.stack([low, high]) + survey.origin)
+    points = points + survey.origin
+    if transform is not None:
+        points = transform.apply(points)
+    return _checked_bounds(survey, np.stack(_finite_bounds(points)))
+
+
+def _finite_bounds(points: Float64) -> tuple[Float64, Float64]:
+    if not len(points):
+        return np.full(3, np.inf), np.full(3, -np.inf)
+    low, high = points.min(axis=0), points.max(axis=0)
+    if not np.isfinite([low, high]).all():
+        points = points[np.isfinite(points).all(axis=1)]
+        if not len(points):
+            return np.full(3, np.inf), np.full(3, -np.inf)
+        low, high = points.min(axis=0), points.max(axis=0)
+    return low, high
+
+
+def _checked_bounds(survey: Survey, bounds: Float64) -> Float64:
+    if not np.isfinite(bounds).all():
+        what = "triangles" if isinstance(survey.geometry, Mesh) else "points"
+        raise InputError(
+            f"{survey.name} has no {what} with finite coordinates.",
+            file=survey.source[0].path if survey.source else None,
+            remedy="Export it again.",
+        )
+    return bounds
+
+
+def _map_corners(maps: Maps) -> Float64:
+    heights = maps.height[np.isfinite(maps.height)]
+    low, high = (float(heights.min()), float(heights.max())) if heights.size else (0.0, 0.0)
+    corners = []
+    for grid in (maps.height_grid, maps.color_grid):
+        if grid is not None:
+            west, south, east, north = grid.bounds
+            corners += [
+                (x, y, z) for x in (west, east) for y in (south, north) for z in (low, high)
+            ]
+    return np.array(corners)
+
+
+def rounded(length: float) -> float:
+    """Drop the last digits, in which 0.1 and 3 × 0.1 / 3 differ."""
+    return float(f"{length:.12g}")

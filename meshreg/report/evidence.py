@@ -32,8 +32,8 @@ def draw_matches(registration: Registration) -> Any:
     figure = style.new_figure(
         11.0,
         tall + 1.5,
-        f"SIFT matches: {inliers.sum()} inliers of {inliers.size} ({share:.1%})",
-        f"green: inliers    orange, thin: outliers    at most {MAX_MATCHES} of each drawn",
+        f"SIFT: {inliers.sum()} of {inliers.size} matches agree ({share:.1%})",
+        f"green: agree    orange, thin: outliers    at most {MAX_MATCHES} of each drawn",
     )
     left, right = figure.add_subplot(1, 2, 1), figure.add_subplot(1, 2, 2)
     pairs = (("reference", left, color), ("moving, as delivered", right, moved))

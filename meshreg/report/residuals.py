@@ -9,45 +9,56 @@ import numpy as np
 from meshreg.report import style
 from meshreg.types import Registration
 
+FAINT = 0.02  # share of the largest weight under which a tile counts for nothing
+
 
 def draw_residuals(registration: Registration) -> Any:
-    """Draw the offsets that are left in each tile, as arrows over the reference's relief."""
+    """Draw the offsets that are left in each tile, as arrows over the reference's relief.
+
+    Tiles that the fit set aside as outliers are crosses: their arrows would hide the others'.
+    """
     field = registration.evidence.get("residuals")
     raster = registration.evidence.get("reference_dem")
     if not field or raster is None or len(np.atleast_1d(field["east"])) == 0:
         return None
-    east, north, d_east, d_north = (
-        np.asarray(field[key], float) for key in ("east", "north", "d_east", "d_north")
-    )
+    places = np.column_stack([field["east"], field["north"]])
+    left = np.column_stack([field["d_east"], field["d_north"]])
+    weight = np.asarray(field["weight"], float)
+    used = weight > FAINT * weight.max()
+    if not used.any():
+        return None
     height, grid = style.reduced_height(raster)
     place = style.Place(grid)
-    length = np.hypot(d_east, d_north)
-    rms = float(np.sqrt(np.mean(length**2)))
+    places = places - [place.east, place.north]
+    length = np.hypot(*left[used].T)
+    rms = float(np.sqrt(np.average(length**2, weights=weight[used])))
     typical = max(float(np.percentile(length, 90)), 1e-9)
     west, south, right, top = grid.bounds
-    spacing = np.sqrt((right - west) * (top - south) / max(len(east), 1))
+    spacing = np.sqrt((right - west) * (top - south) / len(places))
     stretch = 0.8 * spacing / typical
+    key = _round_length(typical)
     figure = style.new_figure(
         7.6,
-        style.panel_size(grid, 6.0) + 1.6,
+        style.panel_size(grid, 6.0) + 1.7,
         "What is left after registration, tile by tile",
-        f"{len(east)} tiles, rms {rms * 1000:.1f} mm, arrows drawn {stretch:,.0f}× too long",
+        f"{used.sum()} of {used.size} tiles, weighted rms {rms * 1000:.1f} mm; "
+        f"arrows drawn {stretch:,.0f}× too long; crosses: set aside as outliers",
     )
     axes = figure.add_subplot()
     shade = 0.55 + 0.45 * np.nan_to_num(style.hillshade(height, grid.cell), nan=1.0)
     look: dict[str, Any] = {"cmap": "gray", "vmin": 0, "vmax": 1}
     axes.imshow(shade, extent=place.extent(grid), interpolation="nearest", **look)
     axes.set_autoscale_on(False)
-    weight = np.asarray(field.get("weight", np.ones_like(east)), float)
-    top_weight = float(weight.max()) if weight.size and weight.max() > 0 else 1.0
     arrows = axes.quiver(
-        east - place.east, north - place.north, d_east, d_north, weight / top_weight,
-        angles="xy", scale_units="xy", scale=1 / stretch, cmap="viridis_r", clim=(0, 1),
-        width=0.005, edgecolor="white", linewidth=0.4,
+        *places[used].T, *left[used].T, weight[used] / weight.max(), angles="xy",
+        scale_units="xy", scale=1 / stretch, cmap="plasma_r", clim=(-0.3, 1), width=0.007,
+        edgecolor="white", linewidth=0.5,
     )  # fmt: skip
-    figure.colorbar(arrows, ax=axes, shrink=0.7, label="weight, relative")
-    key = _round_length(typical)
-    axes.quiverkey(arrows, 0.86, 1.03, key, f"{key * 1000:g} mm", labelpos="E")
+    if not used.all():
+        axes.scatter(*places[~used].T, marker="x", s=25, color="#777777", linewidths=1.0)
+    bar = figure.colorbar(arrows, ax=axes, shrink=0.7, label="weight, relative")
+    bar.ax.set_ylim(0, 1)
+    axes.quiverkey(arrows, 0.04, 1.03, key, f"{key * 1000:g} mm", labelpos="E")
     place.label(axes)
     return figure
 

@@ -27,9 +27,9 @@ import numpy as np, pyvista as pv
 folder, target = sys.argv[1:]
 data = dict(np.load(folder + "/scene.npz"))
 east, north = np.meshgrid(data["east"], data["north"])
-plotter = pv.Plotter(off_screen=True, shape=(1, 2), window_size=(1800, 900), border=False)
+plotter = pv.Plotter(off_screen=True, shape=(1, 2), window_size=(2400, 1200), border=False)
 plotter.set_background("white")
-for column, (name, title) in enumerate((("reference", "reference"), ("moving", "registered"))):
+for column, name in enumerate(("reference", "moving")):
     plotter.subplot(0, column)
     height = data[name]
     seen = np.isfinite(height)
@@ -40,12 +40,11 @@ for column, (name, title) in enumerate((("reference", "reference"), ("moving", "
     surface = surface.threshold(0.5, scalars="seen", all_scalars=True)
     if surface.n_points:
         plotter.add_mesh(surface, scalars="color", rgb=True, ambient=0.25, specular=0.0)
-    plotter.add_text(title, font_size=12, color="black")
 plotter.link_views()
 plotter.view_vector((-0.45, -1.0, 0.9), viewup=(0, 0, 1))
 plotter.reset_camera()
-plotter.camera.zoom(1.25)
-plotter.screenshot(target)
+plotter.camera.zoom(1.2)
+np.save(target, plotter.screenshot(return_img=True))
 """
 
 
@@ -57,7 +56,7 @@ def draw_scene(registration: Registration, path: Path, seconds: float) -> Path |
     environment = {**os.environ, "PYTHONWARNINGS": "ignore"}
     with tempfile.TemporaryDirectory(prefix="meshreg-") as folder:
         np.savez(Path(folder, "scene.npz"), **arrays)
-        picture = Path(folder, "scene.png")
+        picture = Path(folder, "scene.npy")
         command = [sys.executable, "-c", _CHILD, folder, str(picture)]
         try:
             done = subprocess.run(
@@ -77,8 +76,31 @@ def draw_scene(registration: Registration, path: Path, seconds: float) -> Path |
             last = (done.stderr.strip().splitlines() or [f"exit code {done.returncode}"])[-1]
             _LOG.info("No 3-D still: this machine cannot render (%s); see `meshreg doctor`.", last)
             return None
-        path.write_bytes(picture.read_bytes())
+        _save(np.load(picture), path)
     return path
+
+
+def _save(picture: Any, path: Path) -> None:
+    """Crop both halves alike to what they show, and write them side by side with their names."""
+    from PIL import Image, ImageDraw
+
+    half = picture.shape[1] // 2
+    halves = [picture[:, :half], picture[:, half : 2 * half]]
+    shown = (np.minimum(*halves) < 250).any(axis=-1)
+    rows, cols = (np.flatnonzero(shown.any(axis=axis)) for axis in (1, 0))
+    if rows.size == 0:
+        return
+    margin = 30
+    top, left = max(rows[0] - margin, 0), max(cols[0] - margin, 0)
+    parts = [part[top : rows[-1] + margin, left : cols[-1] + margin] for part in halves]
+    image = Image.fromarray(np.hstack(parts))
+    image.thumbnail((style.MAX_PIXELS, style.MAX_PIXELS))
+    canvas = Image.new("RGB", (image.width, image.height + 30), "white")
+    canvas.paste(image, (0, 30))
+    draw = ImageDraw.Draw(canvas)
+    for column, name in enumerate(("reference", "registered")):
+        draw.text((12 + column * image.width // 2, 8), name, fill="black", font_size=18)
+    canvas.save(path, format="PNG")
 
 
 def _arrays(registration: Registration) -> dict[str, Any] | None:

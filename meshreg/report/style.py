@@ -169,7 +169,7 @@ def legend_below(axes: Any, handles: Sequence[Any] | None = None, columns: int =
     options = {"handles": handles} if handles is not None else {}
     axes.legend(
         loc="upper center",
-        bbox_to_anchor=(0.5, -0.16),
+        bbox_to_anchor=(0.5, -0.11),
         ncols=columns,
         frameon=False,
         fontsize=8,

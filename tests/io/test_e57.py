@@ -485,6 +485,29 @@ def test_rewrite_states_the_new_crs(tmp_path, points):
     assert e57_xml.read_layout(tmp_path / "p.e57").crs is None
 
 
+@pytest.mark.parametrize(
+    ("root", "pose"),
+    [
+        ('<coordinateMetadata type="String"/>', '<pose type="Structure"/>'),
+        ('<coordinateMetadata type="String"></coordinateMetadata>', ""),
+        ("", '<pose type="Structure"><translation type="Structure"/></pose>'),
+        ('<a type="Structure"><a type="Integer"/></a>', '<pose type="Structure"></pose>'),
+    ],
+)
+def test_rewrite_finds_the_elements_however_they_are_written(tmp_path, points, root, pose):
+    scans = [{"columns": xyz_columns(points), "pose": pose}, {"columns": xyz_columns(points + 1)}]
+    path = e57_file(tmp_path / "a.e57", scans, root=root)
+    survey = e57.read(path, ReadOptions())
+    target = Frame(np.eye(3), [0, 0, 1.0], "EPSG:32754", "EPSG:32754")
+    utm = Transform(offset=[5e5, 6e6, 0.0])
+    out = tmp_path / "o.e57"
+    e57.rewrite(survey.source[0], make_mover(survey.source[0], utm, target), out)
+    again = e57.read(out, ReadOptions(shift=(0, 0, 1.0)))
+    assert again.crs == "EPSG:32754"
+    expected = np.concatenate([points, points + 1]) + np.array([5e5, 6e6, 0])
+    np.testing.assert_allclose(absolute(again), expected, rtol=0, atol=2e-9)
+
+
 def test_intensity_survives_a_stretch(tmp_path, points):
     bright = np.arange(300.0)
     scan = {"columns": xyz_columns(points) | {"intensity": ("<f8", bright)}}

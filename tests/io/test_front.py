@@ -123,6 +123,15 @@ def test_options_by_record_and_by_name(tmp_path):
         read_survey(path, shfit=(1, 2, 3))
 
 
+def test_options_for_colmap_are_refused_elsewhere(tmp_path):
+    path = ply(tmp_path / "reef.ply")
+    with pytest.raises(UsageError, match=r"scale is for COLMAP.*unit"):
+        read_survey(path, scale=0.5)
+    with pytest.raises(UsageError, match="positions"):
+        read_survey(path, positions=path)
+    assert absolute(read_survey(path, unit="0.5")) == pytest.approx(SQUARE * 0.5)
+
+
 @pytest.mark.parametrize("name", ["reef.ply", "reef.las", "reef.xyz", "reef.tif", "reef.obj"])
 def test_an_empty_file_is_refused(tmp_path, name):
     (tmp_path / name).touch()

@@ -296,6 +296,48 @@ def test_second_set_transform_and_clamp(tmp_path):
     assert mesh.textures[0].clamp
 
 
+@pytest.mark.parametrize(
+    "material",
+    [
+        {"emissiveTexture": {"index": 0}},
+        {"extensions": {"KHR_materials_pbrSpecularGlossiness": {"diffuseTexture": {"index": 0}}}},
+    ],
+)
+def test_other_places_of_the_colour_texture(tmp_path, material):
+    scene = Made()
+    scene.primitive(TEXCOORD_0=scene.accessor(UV, "f"))["material"] = scene.texture((7, 8, 9))
+    scene.tree["materials"] = [material]
+    scene.tree["textures"] = [{"extensions": {"EXT_texture_webp": {"source": 0}}}]
+    mesh = read(scene.glb(tmp_path / "a.glb"), ReadOptions()).geometry
+    assert tuple(mesh.textures[0].load()[0, 0]) == (7, 8, 9)
+
+
+def test_turned_texture_is_refused_but_not_for_geometry(tmp_path):
+    scene = textured()
+    info = scene.tree["materials"][0]["pbrMetallicRoughness"]["baseColorTexture"]
+    info["extensions"] = {"KHR_texture_transform": {"rotation": 0.5}}
+    path = scene.glb(tmp_path / "a.glb")
+    refuse(path, "turns its texture")
+    assert len(read(path, ReadOptions(geometry_only=True)).geometry.faces) == 2
+
+
+@pytest.mark.parametrize(("code", "normalized"), [("h", True), ("H", False), ("b", True)])
+def test_quantized_positions(tmp_path, code, normalized):
+    top = {"h": 32767, "H": 1, "b": 127}[code]
+    whole = np.rint(np.abs(POINTS) * (10 if code == "H" else top / 4)).astype(int)
+    scene = Made()
+    position = scene.accessor(whole, code, stride={"b": 4}.get(code, 8), normalized=normalized)
+    primitive = {
+        "attributes": {"POSITION": position},
+        "indices": scene.accessor(FACES.ravel(), "B"),
+    }
+    scene.tree["meshes"][0]["primitives"] = [primitive]
+    scene.tree["extensionsRequired"] = ["KHR_mesh_quantization"]
+    scene.tree["nodes"][0]["scale"] = [2, 3, 4]
+    survey = read(scene.glb(tmp_path / "a.glb"), ReadOptions(up="z"))
+    np.testing.assert_allclose(absolute(survey), whole / top * [2, 3, 4], atol=1e-9)
+
+
 def test_textures_beside_the_file_and_in_data_uris(tmp_path):
     Image.new("RGB", (3, 3), (1, 2, 3)).save(tmp_path / "my page.png")
     inline = base64.b64encode((tmp_path / "my page.png").read_bytes()).decode()
@@ -885,3 +927,42 @@ def test_maps_are_not_written_and_a_full_disk_leaves_what_was_there(tmp_path, mo
         write(Survey("cloud", PointCloud(POINTS)), target)
     assert target.read_text() == "before"
     assert [item.name for item in tmp_path.iterdir()] == ["b.glb"]
+
+
+def test_a_copy_that_does_not_read_back_is_not_kept(tmp_path, monkeypatch):
+    from meshreg.io.gltf_parts import read_geometry
+
+    calls = []
+
+    def shifted(document):
+        calls.append(1)
+        return read_geometry(document) + (0.01 if len(calls) > 1 else 0.0)
+
+    survey = read(made().glb(tmp_path / "a.glb"), ReadOptions())
+    monkeypatch.setattr("meshreg.io.gltf_rewrite.read_geometry", shifted)
+    with pytest.raises(OutputError, match=r"does not read back.*off by up to 0.01"):
+        rewrite(survey.source[0], mover(survey), tmp_path / "b.glb")
+    assert [item.name for item in tmp_path.iterdir()] == ["a.glb"]
+
+
+def test_glb_without_its_binary_chunk_is_refused(tmp_path):
+    refuse(made().glb(tmp_path / "a.glb", binary=False), "no uri and no BIN chunk")
+
+
+def test_primitives_with_and_without_colours(tmp_path):
+    scene = Made()
+    color = scene.accessor([[9, 8, 7, 255]] * 4, "B", normalized=True)
+    scene.primitive(faces=FACES[0], COLOR_0=color)
+    scene.primitive(faces=FACES[1])
+    survey = read(scene.glb(tmp_path / "a.glb"), ReadOptions())
+    found = survey.geometry.colors[survey.geometry.faces]
+    assert found.tolist() == [[[9, 8, 7]] * 3, [[255] * 3] * 3]
+    assert survey.notes[0] == "1 of 2 primitives have no colours; left white."
+
+
+def test_mirrored_repetition_is_told(tmp_path):
+    scene = textured()
+    scene.tree["samplers"] = [{"wrapS": 33648}]
+    scene.tree["textures"][1]["sampler"] = 0
+    survey = read(scene.glb(tmp_path / "a.glb"), ReadOptions())
+    assert "repeats mirrored" in survey.notes[0]

@@ -376,7 +376,7 @@ def test_files_are_read_as_the_slow_parser_reads_them(tmp_path, text, end):
 
 
 @FILE_CASES
-@given(obj_texts(), st.sampled_from(["\n", "\r\n", "\r"]), st.sampled_from([512, 700]))
+@given(obj_texts(), st.sampled_from(["\n", "\r\n", "\r"]), st.sampled_from([7, 64, 700]))
 def test_where_a_block_of_lines_ends_does_not_matter(tmp_path, text, end, size):
     path = tmp_path / "twin.obj"
     path.write_bytes(text.replace("\n", end).encode() or b"\n")
@@ -399,7 +399,7 @@ def test_a_file_of_many_blocks_equals_its_own_copy_in_one(file, monkeypatch):
     path = file(text)
     one = scan(path)
     same_as_twin(one, text)
-    for size in (200, 1111, 30_000):
+    for size in (50, 1111, 30_000):
         monkeypatch.setattr(line_blocks, "BLOCK", size)
         same_as_twin(scan(path), text)
         assert scan(path).sha256 == one.sha256
@@ -751,10 +751,15 @@ def test_the_line_of_an_error_is_right_in_every_block(file, monkeypatch):
 
 
 def test_a_line_without_end_is_refused(file):
-    for filler in ("#", "v 1 2 3", "v 1 ", "g ", "f " + "1 " * 10):
+    for filler in ("#", "v 1 2 3", "g ", "f " + "1 " * 10):
         text = SQUARE + filler + " " * ((1 << 20) + 10)
         for end in ("", "\nf 1 2 3\n", "\nf 1 2 3\n" * 200_000):
-            assert "line 5" in refusal(file(text + end), ResourceLimitError)
+            assert "longer than 1048576" in refusal(file(text + end), ResourceLimitError)
+    continued = file(SQUARE + "f 1 2 3 " + "4 \\\n" * 300_000)
+    assert "longer than 1048576" in refusal(continued, ResourceLimitError)
+    file("newmtl " + "m" * (3 << 20), "reef.mtl")
+    with pytest.raises(ResourceLimitError, match=r"reef\.mtl"):
+        opened(file(textured()))
     opened(file(SQUARE + "#" * ((1 << 20) - 10) + "\nf 1 2 3\n"))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import struct
 
 import numpy as np
@@ -362,6 +363,7 @@ HEADERS = [
         "twice",
     ),
     (b"ply\nformat ascii 1.0\nelement a 0\nelement a 0\nend_header\n", "twice"),
+    (b"ply\nformat ascii 1.0\n" + b"element a 0\n" * 80_000 + b"end_header\n", "declares 80000"),
     (b"ply\nformat ascii 1.0\nelement a 1\nend_header\n\n", "without a property"),
     (b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n", "x, y and z"),
     (
@@ -539,8 +541,9 @@ def test_pages_outside_the_folder_are_refused(tmp_path, name):
     assert read(path, ReadOptions(geometry_only=True)).geometry.uv is None
 
 
-def test_folder_and_missing_file(tmp_path):
-    for path in (tmp_path, tmp_path / "none.ply"):
+def test_folder_pipe_and_missing_file(tmp_path):
+    os.mkfifo(tmp_path / "pipe.ply")
+    for path in (tmp_path, tmp_path / "none.ply", tmp_path / "pipe.ply"):
         with pytest.raises(InputError):
             read(path, ReadOptions())
 
@@ -767,3 +770,52 @@ def test_full_disk_leaves_what_was_there(tmp_path, monkeypatch):
         rewrite(survey.source[0], mover(survey), target)
     assert target.read_text() == "before"
     assert sorted(item.name for item in tmp_path.iterdir()) == ["a.ply", "b.ply"]
+
+
+@pytest.mark.parametrize(
+    ("face", "row"),
+    [
+        ([("area", "float")], [1.0]),
+        ([("vertex_indices", "int")], [1]),
+        ([("vertex_indices", ("uchar", "float"))], [[0.0, 1.0, 2.0]]),
+    ],
+)
+def test_faces_without_a_list_of_vertices_are_refused(tmp_path, face, row):
+    elements = [("vertex", XYZ, SQUARE), ("face", face, [row])]
+    with pytest.raises(InputError, match="without a list 'vertex_indices' of integers"):
+        read(ply(tmp_path / "a.ply", elements), ReadOptions())
+
+
+def test_texcoord_that_is_no_list_and_colours_of_faces(tmp_path):
+    page(tmp_path / "p.png", (1, 1, 1))
+    face = [INDICES, ("texcoord", "float"), ("red", "uchar")]
+    elements = [("vertex", XYZ, SQUARE), ("face", face, [[[0, 1, 2], 0.5, 9]])]
+    path = ply(tmp_path / "a.ply", elements, comments=["TextureFile p.png"])
+    with pytest.raises(InputError, match="'texcoord' that is no list"):
+        read(path, ReadOptions())
+    survey = read(path, ReadOptions(geometry_only=True))
+    assert "Colours of faces are not used" in survey.notes[0]
+
+
+@pytest.mark.parametrize("order", ["", "<"])
+def test_a_copy_that_does_not_read_back_is_not_kept(tmp_path, monkeypatch, order):
+    """A disk that loses what is written must not leave a wrong survey behind."""
+    from meshreg.errors import OutputError
+
+    survey = read(ply(tmp_path / "a.ply", mesh_elements(), order=order), ReadOptions())
+    monkeypatch.setattr("meshreg.io.ply_write.scalar_columns", _shifted_on_second_reading())
+    with pytest.raises(OutputError, match="does not read back"):
+        rewrite(survey.source[0], mover(survey), tmp_path / "b.ply")
+    assert [item.name for item in tmp_path.iterdir()] == ["a.ply"]
+
+
+def _shifted_on_second_reading():
+    from meshreg.io.ply_body import scalar_columns
+
+    calls = []
+
+    def columns(table, names, dtype=None):
+        calls.append(names)
+        return scalar_columns(table, names, dtype) + (0.01 if len(calls) > 1 else 0.0)
+
+    return columns

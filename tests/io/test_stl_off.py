@@ -215,3 +215,20 @@ def test_off_without_faces_is_a_cloud(tmp_path):
     survey = off.read(made_off(tmp_path / "a.off", "0 0 1\n2 0 1", "OFF\n2 0 0\n"), ReadOptions())
     assert isinstance(survey.geometry, PointCloud)
     np.testing.assert_array_equal(absolute(survey), [[0, 0, 1], [2, 0, 1]])
+
+
+def test_no_mutation_brings_anything_but_an_error_or_a_mesh(tmp_path, kind):
+    module, make, name = kind
+    whole = make(tmp_path / name).read_bytes()
+    rng = np.random.default_rng(5)
+    path = tmp_path / f"mutated_{name}"
+    for _ in range(200):
+        content = bytearray(whole)
+        for at in rng.integers(0, len(content), rng.integers(1, 4)):
+            content[at] = rng.integers(0, 256)
+        path.write_bytes(content)
+        try:
+            survey = module.read(path, ReadOptions())
+        except InputError:
+            continue
+        assert np.isfinite(survey.bounds).all()
