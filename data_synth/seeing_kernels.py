@@ -56,7 +56,7 @@ def shadow(z, i, j, step, east, north, rise):
         light = min(light, 1.0 - over)
         if light <= 0.0:
             return 0.0
-        far *= 1.55
+        far *= 1.75
     return light
 
 

@@ -7,6 +7,7 @@ imports it, and the main program must live to say so.
 from __future__ import annotations
 
 import os
+import shlex
 import shutil
 import subprocess
 import sys
@@ -172,7 +173,13 @@ def _proj() -> Check:
     found, said = run_probe(_PROJ)
     misled = [name for name in ("PROJ_DATA", "PROJ_LIB") if name in os.environ]
     if found or not misled:
-        return Check("PROJ", "ok" if found else "missing", use, said, "" if found else _PROJ_REMEDY)
+        return Check(
+            "PROJ",
+            "ok" if found else "missing",
+            use,
+            said,
+            "" if found else _reinstall("pyproj rasterio"),
+        )
     clean = "import os\nfor n in ('PROJ_DATA', 'PROJ_LIB'): os.environ.pop(n, None)\n"
     state: State = "optional" if run_probe(clean + _PROJ)[0] else "missing"
     return Check("PROJ", state, use, f"{' and '.join(misled)} lead astray: {said}", _UNSET)
@@ -190,17 +197,21 @@ def _writable(name: str, folder: Path, use: str) -> Check:
     return Check(name, "missing" if few else "ok", use, detail, "free some disk" if few else "")
 
 
+def _pip(package: str) -> str:
+    python = os.path.relpath(sys.executable)
+    python = sys.executable if python.startswith("..") else python
+    return f"{shlex.quote(python)} -m pip install {package}"
+
+
 def _reinstall(package: str) -> str:
-    return f"{Path(sys.executable).name} -m pip install --force-reinstall {package}"
+    return _pip(f"--force-reinstall {package}")
 
 
-_PROJ_REMEDY = _reinstall("pyproj rasterio")
 _UNSET = "unset PROJ_DATA PROJ_LIB"
 
 
 def examine() -> tuple[Check, ...]:
     """Probe the machine; the probes run in child processes, a few at a time (about 10 s)."""
-    python = Path(sys.executable).name
     jobs = [
         lambda: _library("libGL.so.1", "Open3D, 3-D pictures"),
         lambda: _library("libEGL.so.1", "3-D pictures without a screen"),
@@ -224,21 +235,21 @@ def examine() -> tuple[Check, ...]:
             "LAS, LAZ, COPC",
             "import laspy, lazrs; print('laspy', laspy.__version__)",
             needed=False,
-            remedy=f"{python} -m pip install 'laspy[lazrs]'",
+            remedy=_pip("'laspy[lazrs]'"),
         ),
         lambda: _probe(
             "COLMAP",
             "COLMAP model folders",
             "import pycolmap; print('pycolmap', pycolmap.__version__)",
             needed=False,
-            remedy=f"{python} -m pip install pycolmap",
+            remedy=_pip("pycolmap"),
         ),
         lambda: _probe(
             "E57",
             "E57 scans",
             _PYE57,
             needed=False,
-            remedy=f"{python} -m pip install 'meshreg[e57]'",
+            remedy=_pip("pye57"),
         ),
         lambda: _probe(
             "Open3D",

@@ -28,7 +28,7 @@ def show(checks: Sequence[Check], voice: Voice) -> None:
     for check in checks:
         table.add_row(_MARKS[check.state], escape(check.name), check.use, escape(check.detail))
     voice.out.print(table)
-    remedies = list(dict.fromkeys(check.remedy for check in checks if check.remedy))
+    remedies = _commands(checks)
     if not remedies:
         voice.out.print("[green]Nothing is missing.[/]")
         return
@@ -37,3 +37,16 @@ def show(checks: Sequence[Check], voice: Voice) -> None:
         voice.out.print(f"  {escape(remedy)}")
     if all(check.state != "missing" for check in checks):
         voice.out.print("The main job runs without them.")
+
+
+def _commands(checks: Sequence[Check]) -> list[str]:
+    """Return the remedies, each once, and all Debian packages in one command."""
+    apt = "apt-get install "
+    packages: dict[str, None] = {}
+    others: dict[str, None] = {}
+    for remedy in (check.remedy for check in checks if check.remedy):
+        if remedy.startswith(apt):
+            packages.update(dict.fromkeys(remedy.removeprefix(apt).split()))
+        else:
+            others[remedy] = None
+    return [*([apt + " ".join(packages)] if packages else []), *others]

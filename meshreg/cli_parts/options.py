@@ -37,7 +37,7 @@ def join_settings(
 
 def read_options(shift: str | None, name: str, **said: Any) -> ReadOptions:
     """Return what the user says of a survey; `name` is the option that gave the shift."""
-    plain = {
+    plain: dict[str, Any] = {
         key: str(value) if isinstance(value, StrEnum) else value for key, value in said.items()
     }
     return ReadOptions(shift=None if shift is None else _triple(shift, name), **plain)

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from meshreg.errors import InputError, OutputError, UsageError
-from meshreg.io import e57_xml
+from meshreg.io import e57_pages, e57_xml
 from meshreg.io.crs import crs_text
 from meshreg.io.e57_scans import (
     CARTESIAN,
@@ -33,6 +33,7 @@ from meshreg.io.e57_scans import (
 from meshreg.io.e57_xml import Layout
 from meshreg.io.frames import Mover, place
 from meshreg.io.options import ReadOptions
+from meshreg.io.rewriting import require_unchanged
 from meshreg.io.safe import atomic_file, fingerprint, open_regular, sha256
 from meshreg.types import Float64, PointCloud, SourceFile, Survey, UInt8
 
@@ -161,9 +162,12 @@ def rewrite(source: SourceFile, move: Mover, path: Path) -> tuple[Path, ...]:
 
     Raises
     ------
+    InputError
+        The file has changed since it was read.
     OutputError
         Not written, or not what was meant when read back.
     """
+    require_unchanged(source, path)
     layout = e57_xml.read_layout(source.path)
     with atomic_file(path) as temporary:
         if _is_rigid(source.path, layout, move):
@@ -217,19 +221,19 @@ def _rewrite_poses(path: Path, layout: Layout, move: Mover, target: Path) -> Non
     with open_regular(path) as old, open(target, "r+b") as new:
         shutil.copyfileobj(old, new, 1 << 20)
         # Where binary sections follow the XML, the new one goes behind them on its own page.
-        end = old.tell() // e57_xml.PAGE * e57_xml.PAYLOAD
+        end = old.tell() // e57_pages.PAGE * e57_pages.PAYLOAD
         start = layout.xml_start if layout.xml_is_last else end
-        page = start // e57_xml.PAYLOAD
-        old.seek(page * e57_xml.PAGE)
-        before = old.read(start - page * e57_xml.PAYLOAD)
-        new.truncate(page * e57_xml.PAGE)
-        new.seek(page * e57_xml.PAGE)
-        new.write(e57_xml.paged(before + xml))
+        page = start // e57_pages.PAYLOAD
+        old.seek(page * e57_pages.PAGE)
+        before = old.read(start - page * e57_pages.PAYLOAD)
+        new.truncate(page * e57_pages.PAGE)
+        new.seek(page * e57_pages.PAGE)
+        new.write(e57_pages.paged(before + xml))
         size = new.tell()
         new.seek(0)
-        first = new.read(e57_xml.PAYLOAD)
+        first = new.read(e57_pages.PAYLOAD)
         new.seek(0)
-        new.write(e57_xml.header_page(first, size, e57_xml.to_physical(start), len(xml)))
+        new.write(e57_pages.header_page(first, size, e57_pages.to_physical(start), len(xml)))
 
 
 def _rewrite_points(path: Path, layout: Layout, move: Mover, target: Path, shown: Path) -> None:

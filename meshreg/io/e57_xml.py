@@ -1,7 +1,5 @@
-"""The paged container of an E57 file and the XML in it, read without trusting either.
+"""The XML section of an E57 file, which describes scans, poses and fields; read without trust.
 
-An E57 file (ASTM E2807) is a row of 1024-byte pages, each ending in the CRC-32C of its first 1020
-bytes. A 48-byte header says where the XML section lies that describes scans, poses and fields.
 libE57Format hands this XML to a parser that follows external entities, so it is checked here
 first; and a registration only has to rewrite the poses in it, so every other byte can stay.
 """
@@ -9,23 +7,18 @@ first; and a registration only has to rewrite the poses in it, so every other by
 from __future__ import annotations
 
 import re
-import struct
 from dataclasses import dataclass, field
 from pathlib import Path
 from xml.parsers import expat
 
 import numpy as np
 
-from meshreg.errors import InputError, ResourceLimitError, UnsafeReferenceError
+from meshreg.errors import InputError, UnsafeReferenceError
+from meshreg.io.e57_pages import AGAIN, PAGE, PAYLOAD, check_header, logical_bytes, to_logical
 from meshreg.io.safe import file_bytes
-from meshreg.types import Float64, UInt8
+from meshreg.types import Float64
 
-PAGE = 1024
-PAYLOAD = PAGE - 4
-MAX_XML = 100_000_000
 MAX_DEPTH = 64
-_HEADER = struct.Struct("<8sIIQQQQ")
-_AGAIN = "The file is cut off or damaged; export or copy it again."
 
 
 @dataclass(frozen=True)
@@ -85,9 +78,9 @@ def read_layout(path: Path) -> Layout:
         An XML section over 100 MB.
     """
     data = file_bytes(path)
-    start, length = _check_header(data, path)
+    start, length = check_header(data, path)
     logical_start = to_logical(start)
-    xml = _logical(data, logical_start, length)
+    xml = logical_bytes(data, logical_start, length)
     _refuse_declarations(xml, path)
     walk = _parse(xml, path)
     is_last = (logical_start + length + PAYLOAD - 1) // PAYLOAD * PAGE >= data.size
@@ -97,60 +90,19 @@ def read_layout(path: Path) -> Layout:
     return layout
 
 
-def _check_header(data: UInt8, path: Path) -> tuple[int, int]:
-    """Return the XML section's physical offset and logical length."""
-
-    def refuse(message: str, remedy: str = _AGAIN) -> InputError:
-        return InputError(message, file=path, place="header", remedy=remedy)
-
-    if data.size < _HEADER.size or data[:8].tobytes() != b"ASTM-E57":
-        raise refuse("is not an E57 file (it does not start with ASTM-E57).")
-    _, major, _, size, start, length, page = _HEADER.unpack(data[:48].tobytes())
-    if major != 1:
-        raise refuse(f"is E57 version {major}; version 1 is known.", "Export it as E57 1.0.")
-    if page != PAGE:
-        raise refuse(f"declares pages of {page} bytes; E57 1.0 has {PAGE}.")
-    if size != data.size or size % PAGE:
-        raise refuse(f"declares {size} bytes, but the file has {data.size}.")
-    if start < _HEADER.size or start >= size or start % PAGE >= PAYLOAD:
-        raise refuse(f"places its XML section at byte {start} of {size}.")
-    if length > MAX_XML:
-        raise ResourceLimitError(
-            f"declares an XML section of {length} bytes; {MAX_XML} are the limit.", file=path
-        )
-    if to_logical(start) + length > size // PAGE * PAYLOAD:
-        raise refuse(f"declares an XML section of {length} bytes, which runs past its end.")
-    return start, length
-
-
-def to_logical(physical: int) -> int:
-    """Return the offset among the payload bytes of an offset in the file."""
-    return physical // PAGE * PAYLOAD + physical % PAGE
-
-
-def to_physical(logical: int) -> int:
-    """Return the offset in the file of an offset among the payload bytes."""
-    return logical // PAYLOAD * PAGE + logical % PAYLOAD
-
-
-def _logical(data: UInt8, start: int, length: int) -> bytes:
-    """Return payload bytes, checksums left out."""
-    first, last = start // PAYLOAD, (start + length + PAYLOAD - 1) // PAYLOAD
-    payload = data[first * PAGE : last * PAGE].reshape(-1, PAGE)[:, :PAYLOAD].tobytes()
-    return payload[start - first * PAYLOAD :][:length]
-
-
 def _refuse_declarations(xml: bytes, path: Path) -> None:
     """Let no document type or entity through, in whatever encoding it may hide."""
-    declared = re.match(rb"\s*<\?xml[^>]*?encoding\s*=\s*[\"']([^\"']*)[\"']", xml[:300])
-    encoding = declared.group(1).lower() if declared else b"utf-8"
     text = xml.removeprefix(b"\xef\xbb\xbf")
+    # The declaration may be padded: look at all of it.
+    head = text[: text.find(b"?>") + 2] if text.startswith(b"<?xml") else b""
+    declared = re.search(rb"encoding\s*=\s*[\"']([^\"']*)[\"']", head)
+    encoding = declared.group(1).lower() if declared else b"utf-8"
     if not text.startswith(b"<") or b"\0" in xml or encoding not in (b"utf-8", b"us-ascii"):
         raise InputError(
             f"has an XML section that is not UTF-8 (declared as {encoding.decode('latin-1')!r}).",
             file=path,
             place="XML section",
-            remedy=_AGAIN,
+            remedy=AGAIN,
         )
     found = re.search(rb"<!\s*(DOCTYPE|ENTITY)", xml, re.IGNORECASE)
     if found:
@@ -172,14 +124,14 @@ def _parse(xml: bytes, path: Path) -> _Walk:
             f"has an XML section that cannot be read: {error}.",
             file=path,
             place="XML section",
-            remedy=_AGAIN,
+            remedy=AGAIN,
         ) from error
     except ValueError as error:
         raise InputError(
             f"has a value in its XML section that is no number: {error}.",
             file=path,
             place=f"line {walk.parser.CurrentLineNumber} of the XML section",
-            remedy=_AGAIN,
+            remedy=AGAIN,
         ) from error
     return walk
 
@@ -209,7 +161,7 @@ class _Walk:
                 f"nests its XML deeper than {MAX_DEPTH} elements.",
                 file=self.path,
                 place="XML section",
-                remedy=_AGAIN,
+                remedy=AGAIN,
             )
         if self.stack == ["e57Root", "coordinateMetadata"]:
             self.crs_span = (self.parser.CurrentByteIndex, 0)
@@ -275,7 +227,7 @@ def _unit(quaternion: Float64, path: Path) -> Float64:
             f"has a pose whose rotation is {quaternion.tolist()}, which is no rotation.",
             file=path,
             place="XML section",
-            remedy=_AGAIN,
+            remedy=AGAIN,
         )
     return quaternion / norm
 
@@ -298,30 +250,8 @@ def _check_count(scan: Entry, number: int, size: int, path: Path) -> None:
             f"declares {scan.count} points of {bits} bits each, but the file has {size} bytes.",
             file=path,
             place=f"scan {number + 1}",
-            remedy=_AGAIN,
+            remedy=AGAIN,
         )
-
-
-_CRC_TABLE = []
-for _byte in range(256):
-    for _ in range(8):
-        _byte = _byte >> 1 ^ (0x82F63B78 if _byte & 1 else 0)
-    _CRC_TABLE.append(_byte)
-
-
-def page_checksum(payload: bytes) -> bytes:
-    """Return the CRC-32C of a page's payload as E57 stores it (big-endian)."""
-    crc = 0xFFFFFFFF
-    for byte in payload:
-        crc = crc >> 8 ^ _CRC_TABLE[(crc ^ byte) & 0xFF]
-    return struct.pack(">I", crc ^ 0xFFFFFFFF)
-
-
-def paged(payload: bytes) -> bytes:
-    """Return payload bytes as whole pages with their checksums, the last one filled up."""
-    payload += b" " * (-len(payload) % PAYLOAD)
-    parts = (payload[at : at + PAYLOAD] for at in range(0, len(payload), PAYLOAD))
-    return b"".join(part + page_checksum(part) for part in parts)
 
 
 def with_poses(layout: Layout, poses: list[tuple[Float64, Float64]], crs: str | None) -> bytes:
@@ -361,10 +291,3 @@ def _pose_text(rotation: Float64, translation: Float64) -> bytes:
         + values("xyz", translation)
         + "</translation></pose>"
     ).encode("ascii")
-
-
-def header_page(first_page: bytes, size: int, xml_start: int, xml_length: int) -> bytes:
-    """Return the file's first page with new lengths (file, XML offset, XML length) and checksum."""
-    signature, major, minor, _, _, _, page = _HEADER.unpack(first_page[: _HEADER.size])
-    header = _HEADER.pack(signature, major, minor, size, xml_start, xml_length, page)
-    return paged(header + first_page[_HEADER.size : PAYLOAD])

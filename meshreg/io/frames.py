@@ -16,7 +16,15 @@ import numpy as np
 
 from meshreg.errors import InputError, MeshregError, UsageError
 from meshreg.io.bridge import bridge
-from meshreg.io.crs import crs_name, crs_text, grid_scale_and_convergence, metric_crs
+from meshreg.io.crs import (
+    crs_name,
+    crs_text,
+    grid_scale_and_convergence,
+    metres_per_unit,
+    metric_crs,
+    parse_crs,
+    vertical_part,
+)
 from meshreg.io.framing import ENU, NED, UNITS, Y_UP, frame_from
 from meshreg.io.mover import Mover, frame_matrix, make_mover, to_absolute, to_file
 from meshreg.io.options import ReadOptions
@@ -129,6 +137,9 @@ def _frame_notes(
             f"Coordinates were taken from {crs_name(frame.file_crs)} to {crs_name(frame.crs)}"
             + (f" ({how})." if how else ".")
         )
+        unit = metres_per_unit(frame.file_crs)
+        if unit != 1 and vertical_part(parse_crs(frame.file_crs)) is None:
+            notes.append(f"No unit of heights is stated: they were taken in {unit:.9g} m, too.")
     return tuple(notes)
 
 

@@ -13,19 +13,19 @@ from typing import Literal
 
 import numpy as np
 
-from meshreg.errors import InputError, MeshregError, UsageError
+from meshreg.errors import InputError, UsageError
 from meshreg.io.bridge import bridge
-from meshreg.io.crs import crs_name, metres_up, parse_crs
-from meshreg.io.frames import frame_from
 from meshreg.io.geotiff import is_picture
-from meshreg.io.geotiff_values import RawMap, height_unit, read_color, read_height
+from meshreg.io.geotiff_values import RawMap, read_color, read_height
 from meshreg.io.geotiff_write import write_color, write_height
+from meshreg.io.maps_frame import color_frame, is_height, map_frame, on_map, placed_raw
 from meshreg.io.mover import Mover, to_absolute
 from meshreg.io.options import ReadOptions
-from meshreg.io.regrid import Forward, Placed, covering_grid, placed_grid, regrid
+from meshreg.io.regrid import covering_grid, placed_grid, regrid
+from meshreg.io.rewriting import require_unchanged
 from meshreg.io.safe import fingerprint, sha256
 from meshreg.io.sidecar import SidecarInfo, find_sidecar
-from meshreg.types import Bool, Float32, Frame, Grid, Maps, SourceFile, Survey, SurveyRaster, UInt8
+from meshreg.types import Float64, Frame, Grid, Maps, SourceFile, Survey, SurveyRaster
 
 log = logging.getLogger("meshreg")
 
@@ -94,19 +94,24 @@ def read_pair(dem: Path, ortho: Path | None, options: ReadOptions) -> Survey:
     if ortho is not None and not is_picture(ortho, options.max_pixels):
         raise InputError("is a DEM, not a picture.", file=ortho, remedy=_PAIR)
     heights = read_height(dem, options.max_pixels)
+    colors = None if ortho is None else read_color(ortho, options.max_pixels)
+    notes = [*heights.notes, *(colors.notes if colors is not None else ())]
+    if colors is not None and colors.crs is not None and not (heights.crs or options.crs):
+        notes.append("The DEM states no CRS; the orthomosaic's was taken for it.")
+        options = replace(options, crs=colors.crs)
     sidecar = find_sidecar(dem, shared=False)
-    frame = _frame(heights, options, sidecar)
-    notes = [*heights.notes]
-    height, _, height_grid = _on_map(heights, frame, notes)
-    sources = [_source(dem, frame, heights, sidecar)]
+    frame = map_frame(heights, options, sidecar)
+    if any(frame.shift):
+        text = ", ".join(f"{value:.12g}" for value in frame.shift)
+        notes.append(f"The shift ({text}) is added to the maps' coordinates.")
+    height, _, height_grid = on_map(heights, frame, notes)
+    sources = [_source(heights, frame, sidecar)]
     maps = Maps(np.asarray(height, np.float32), height_grid)
-    if ortho is not None:
-        colors = read_color(ortho, options.max_pixels)
-        notes += colors.notes
-        color_frame = _color_frame(colors, options, frame, notes)
-        color, valid, color_grid = _on_map(colors, color_frame, notes)
-        _require_overlap(height_grid, color_grid, ortho)
-        sources.append(_source(ortho, color_frame, colors, None, companions=(dem,)))
+    if colors is not None:
+        own = color_frame(colors, options, frame, notes)
+        color, valid, color_grid = on_map(colors, own, notes)
+        _require_overlap(height_grid, color_grid, colors.path)
+        sources.append(_source(colors, own, None, companions=(dem,)))
         maps = Maps(maps.height, height_grid, np.asarray(color, np.uint8), valid, color_grid)
     for note in notes:
         log.warning("%s: %s", dem.name, note)
@@ -122,112 +127,22 @@ def read_pair(dem: Path, ortho: Path | None, options: ReadOptions) -> Survey:
 
 
 def _source(
-    path: Path,
-    frame: Frame,
     raw: RawMap,
+    frame: Frame,
     sidecar: SidecarInfo | None,
     companions: tuple[Path, ...] = (),
 ) -> SourceFile:
     rows, cols = raw.valid.shape
     return SourceFile(
-        path=path,
+        path=raw.path,
         format="maps",
         frame=frame,
         companions=companions,
         sidecar=None if sidecar is None else sidecar.path,
-        sha256=sha256(path),
-        fingerprint=fingerprint(path),
+        sha256=sha256(raw.path),
+        fingerprint=fingerprint(raw.path),
         counts={"rows": rows, "cols": cols, "valid": int(np.count_nonzero(raw.valid))},
     )
-
-
-def _frame(raw: RawMap, options: ReadOptions, sidecar: SidecarInfo | None) -> Frame:
-    """Join options, sidecar and file; the axes carry unit and sign of the heights."""
-    if options.up == "y" or options.axes not in (None, "enu", "ned"):
-        raise UsageError("A map's heights are up (or down, by axes='ned'), never y.", file=raw.path)
-    said = sidecar or SidecarInfo()
-    unit = options.unit if options.unit is not None else said.unit
-    metres = height_unit(raw, None if unit is None else str(unit))
-    crs = options.crs or said.crs or raw.crs
-    if crs is None:
-        level = height_unit(raw, str(unit)) if unit is not None else 1.0
-        axes = np.diag([level or 1.0, level or 1.0, metres or 1.0])
-    else:
-        # PROJ's way to the metric CRS multiplies heights by the unit that the CRS states.
-        axes = np.diag(
-            [1.0, 1.0, 1.0 if metres is None else metres / abs(metres_up(parse_crs(crs)))]
-        )
-    if (options.axes or said.axes) == "ned":
-        axes[2, 2] *= -1
-    plain = replace(options, unit=None, axes=None, up=None)
-    rows, cols = raw.valid.shape
-    centre = np.array([*(raw.matrix @ [cols / 2, rows / 2, 1]), _level(raw)])
-    try:
-        return frame_from(
-            plain, replace(said, unit=None, axes=None, up=None), raw.crs, axes, centre=centre
-        )
-    except MeshregError as error:
-        error.file = error.file or str(raw.path)
-        raise
-
-
-def _color_frame(raw: RawMap, options: ReadOptions, dem: Frame, notes: list[str]) -> Frame:
-    """Return the orthomosaic's frame, which leads to the DEM's CRS."""
-    if raw.crs is None or dem.file_crs is None or options.crs is not None:
-        if (raw.crs is None) != (dem.file_crs is None):
-            one = "orthomosaic" if raw.crs is None else "DEM"
-            notes.append(f"The {one} states no CRS; that of the other map was taken for both.")
-        if dem.file_crs is None and raw.crs is not None:
-            return Frame(dem.axes, dem.shift)
-        return dem
-    frame = _frame(raw, replace(options, shift=tuple(dem.shift)), None)
-    if frame.crs != dem.crs:
-        notes.append(f"The orthomosaic was taken from {crs_name(raw.crs)} to {crs_name(dem.crs)}.")
-    return replace(frame, crs=dem.crs)
-
-
-def _level(raw: RawMap) -> float:
-    """Return a height amid the data, in the file's unit; 0 for a picture."""
-    return (
-        float(np.nanmedian(raw.values[::7, ::7]))
-        if _is_height(raw) and np.isfinite(raw.values[::7, ::7]).any()
-        else 0.0
-    )
-
-
-def _is_height(raw: RawMap) -> bool:
-    return raw.values.ndim == 2
-
-
-def _placed(raw: RawMap, forward: Forward) -> Placed:
-    return Placed(raw.matrix, raw.valid.shape, forward, _level(raw))
-
-
-def _on_map(raw: RawMap, frame: Frame, notes: list[str]) -> tuple[Float32 | UInt8, Bool, Grid]:
-    """Return a raster's values on a north-up square grid in metres, sampled anew if need be."""
-    (a, b, west), (d, e, north) = raw.matrix.tolist()
-    rows, cols = raw.valid.shape
-    shift = frame.shift.tolist()
-    square = abs(a - abs(e)) * max(rows, cols) < 0.01 * abs(a)
-    if frame.is_linear and np.array_equal(frame.axes[:2, :2], np.eye(2)) and not (b or d) and a > 0:
-        if square:
-            values, valid = raw.values, raw.valid
-            if e > 0:  # row 0 in the south
-                values, valid, north = values[::-1], valid[::-1], north + rows * e
-            grid = Grid(west + shift[0], north + shift[1], a, (rows, cols), frame.crs)
-            if _is_height(raw) and (frame.axes[2, 2], shift[2]) != (1, 0):
-                values = (values * frame.axes[2, 2] + shift[2]).astype(np.float32)
-            return values, valid, grid
-        why = f"its pixels are {a:.9g} by {abs(e):.9g}"
-    elif b or d:
-        why = "it is rotated"
-    else:
-        why = f"it is in {crs_name(frame.file_crs)}"
-    placed = _placed(raw, lambda points: to_absolute(frame, points))
-    grid = covering_grid(placed, frame.crs)
-    notes.append(f"{raw.path.name} was sampled anew to squares of {grid.cell:.6g} m, as {why}.")
-    values, valid = regrid(raw.values, raw.valid, placed, grid, is_height=_is_height(raw))
-    return values, valid, grid
 
 
 def _require_overlap(dem: Grid, ortho: Grid, path: Path) -> None:
@@ -288,24 +203,25 @@ def rewrite(source: SourceFile, move: Mover, path: Path) -> tuple[Path, ...]:
 
     Raises
     ------
-    InputError, OutputError
-        As on reading and writing.
+    InputError
+        The file has changed since it was read, or is damaged.
+    OutputError
+        It could not be written, or did not read back as written.
     """
 
-    def forward(
-        points: np.ndarray[tuple[int, ...], np.dtype[np.float64]],
-    ) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
+    def forward(points: Float64) -> Float64:
         return to_absolute(move.frame, move.points(points))
 
+    require_unchanged(source, path)
     picture = is_picture(source.path, _ANY_SIZE)
     raw = (read_color if picture else read_height)(source.path, _ANY_SIZE)
     surface_raw = raw
     if picture and source.companions:
         surface_raw = read_height(source.companions[0], _ANY_SIZE)
-    surface_placed = _placed(surface_raw, forward)
-    placed = replace(_placed(raw, forward), level=surface_placed.level)
+    surface_placed = placed_raw(surface_raw, forward)
+    placed = replace(placed_raw(raw, forward), level=surface_placed.level)
     surface = None
-    if _is_height(surface_raw):
+    if is_height(surface_raw):
         surface = (np.asarray(surface_raw.values, np.float32), surface_placed)
     grid = covering_grid(placed, move.frame.crs)
     values, valid = regrid(

@@ -200,6 +200,8 @@ def _mover_of_blocks(move: Mover, path: Path) -> Callable[[Block], tuple[UInt8, 
         decimals = np.empty((most, 3), np.int64)
         state = np.zeros(N_STATE, np.int64)
         n = kernels.find_vectors(block.data, block.end, kinds, spans, values, decimals, state)
+        if n == 0:
+            return block.data[: block.end], np.empty((0, 3))
         kinds, spans, values, decimals = kinds[:n], spans[:n], values[:n], decimals[:n]
         _read_rest(block, spans, values)
         points = moved_points(move, values[kinds == 0])

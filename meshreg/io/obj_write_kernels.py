@@ -208,6 +208,9 @@ def find_vectors(
     """
     found, here = 0, 0
     while here < end:
+        if data[here] == 102 or (data[here] == 118 and data[here + 1] == 116):  # f, vt
+            while data[here] != 10 and data[here] != 13:
+                here += 1
         here = skip_blanks(data, here, state)
         kind = -1
         if data[here] == 118 and is_blank(data[here + 1]):
@@ -260,12 +263,10 @@ def put_vectors(data: Any, end: int, spans: Any, values: Any, decimals: Any, out
                 continue
             if abs(value) >= _LARGEST:
                 return -1
-            for place in range(here, spans[row, k, 0]):
-                out[at] = data[place]
-                at += 1
+            gap = spans[row, k, 0] - here
+            out[at : at + gap] = data[here : here + gap]
+            at += gap
             at = _put_fixed(value, decimals[row, k], out, at)
             here = spans[row, k, 1]
-    for place in range(here, end):
-        out[at] = data[place]
-        at += 1
-    return at
+    out[at : at + end - here] = data[here:end]
+    return at + end - here

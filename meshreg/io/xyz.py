@@ -14,6 +14,7 @@ from meshreg.io.cloud import without_strays
 from meshreg.io.frames import ENU, place
 from meshreg.io.options import ReadOptions
 from meshreg.io.safe import file_bytes, fingerprint, sha256
+from meshreg.io.sidecar import find_sidecar
 from meshreg.io.xyz_layout import Layout, read_layout
 from meshreg.io.xyz_values import read_values, wanted_columns
 from meshreg.io.xyz_write import rewrite, write
@@ -58,18 +59,10 @@ def read(path: Path, options: ReadOptions) -> Survey:
     layout, points, colors = _interpreted(layout, values, path, options, notes)
     n_rows = len(values)
     del values
-    finite = np.isfinite(points).all(axis=1)
-    if not finite.all():
-        notes.append(f"{n_rows - np.count_nonzero(finite)} rows without coordinates were left out.")
-        points, colors = points[finite], None if colors is None else colors[finite]
-    if not len(points):
-        raise InputError("holds no points.", file=path, remedy="Export it again.")
-    keep = without_strays(points, notes)
-    if keep is not None:
-        points, colors = points[keep], None if colors is None else colors[keep]
+    points, colors = _cleaned(points, colors, path, notes)
     for note in notes:
         _LOG.warning("%s: %s", path.name, note)
-    crs = "EPSG:4326" if layout.lonlat and options.crs is None else None
+    crs = "EPSG:4326" if layout.lonlat and not _crs_is_said(path, options) else None
     axes = _Z_DOWN if layout.down else ENU
     placed = place(path, points, options, crs, axes)
     source = SourceFile(
@@ -92,6 +85,27 @@ def read(path: Path, options: ReadOptions) -> Survey:
     )
 
 
+def _crs_is_said(path: Path, options: ReadOptions) -> bool:
+    sidecar = find_sidecar(path)
+    return options.crs is not None or (sidecar is not None and sidecar.crs is not None)
+
+
+def _cleaned(
+    points: Float64, colors: UInt8 | None, path: Path, notes: list[str]
+) -> tuple[Float64, UInt8 | None]:
+    """Leave out rows without coordinates and strays."""
+    finite = np.isfinite(points).all(axis=1)
+    if not finite.all():
+        notes.append(f"{np.count_nonzero(~finite)} rows without coordinates were left out.")
+        points, colors = points[finite], None if colors is None else colors[finite]
+    if not len(points):
+        raise InputError("holds no points.", file=path, remedy="Export it again.")
+    keep = without_strays(points, notes)
+    if keep is None:
+        return points, colors
+    return points[keep], None if colors is None else colors[keep]
+
+
 def _interpreted(
     layout: Layout, values: Float64, path: Path, options: ReadOptions, notes: list[str]
 ) -> tuple[Layout, Float64, UInt8 | None]:
@@ -111,7 +125,7 @@ def _interpreted(
     if layout.down and np.nanmedian(points[:, 2]) < 0:
         layout = replace(layout, down=False)
         notes.append("Depths are negative; they were taken as heights.")
-    if layout.lonlat and options.crs is None:
+    if layout.lonlat and not _crs_is_said(path, options):
         notes.append("Longitude and latitude were taken as WGS 84 (EPSG:4326).")
     colored = set(_RGB) <= layout.where.keys() and not options.geometry_only
     return layout, points, _colors(columns(_RGB), notes) if colored else None

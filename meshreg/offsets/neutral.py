@@ -69,7 +69,7 @@ def _flipped(kind: Kind, parts: Parts) -> Parts:
 
 
 def fields(raster: SurveyRaster, channel: Channel) -> Fields:
-    """Reduce a raster to its change-resistant fields: height or grey, and its slope's direction."""
+    """Reduce a raster to its change-resistant fields: height or grey, and slope directions."""
     kinds: tuple[Kind, ...]
     if channel == "terrain":
         mask = raster.valid

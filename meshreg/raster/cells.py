@@ -38,7 +38,7 @@ def choose_cells(
     The DEM's cell is the paper's 0.10 m, but not finer than the points (three times the spacing
     of a cloud's points, so that the orthomosaic's cells of half the size hold two points each) or
     the texels; and finer where the patch is under 5 m across (50 cells at least) or its points are
-    under 2 mm apart. It is 1, 2 or 5 times a power of ten. The orthomosaic has half that cell.
+    under 2 mm apart. It has one digit. The orthomosaic has half that cell.
     SIFT works at the coarser texture's spacing, not finer than 0.01 m and not coarser than the
     orthomosaic, and coarsens where its raster would have over a quarter of `settings.max_cells`.
 
@@ -126,9 +126,11 @@ def _across(survey: Survey) -> float:
 
 
 def _round_up(length: float) -> float:
-    """Smallest 1, 2 or 5 times a power of ten that is not over 10 % below `length`."""
+    """Smallest power of ten times 1, 2, 3, 4, 5, 6 or 8 that is not over 10 % below `length`."""
     power = 10.0 ** math.floor(math.log10(length))
-    return next(rounded(step * power) for step in (1, 2, 5, 10, 20) if step * power >= 0.9 * length)
+    return next(
+        rounded(step * power) for step in (1, 2, 3, 4, 5, 6, 8, 10) if step * power >= 0.9 * length
+    )
 
 
 def _round_down(length: float) -> float:

@@ -15,8 +15,11 @@ from meshreg.types import Bool, Float32, Grid, SurveyRaster, Transform, UInt8
 
 _FLAT_SHARE = 0.005  # of the colored cells: less is not worth a mask
 _FLAT_TEXELS = 12  # width of a flat piece: over one 8 × 8 block of JPEG, which may well be flat
-_FLAT_STEP = 8  # grey levels by which flat fill differs from what lies around it
+_FLAT_STEP = 10  # grey levels by which flat fill differs from what lies around it
+_ABRUPT = 0.7  # of the difference farther out (16 texels) is there at the border already
 _FLAT_COLORS = 8  # colors looked at
+_BLOCK_TEXELS = 16  # width of a block of JPEG with halved color
+_ALIKE = 32  # grey levels to which such a block may have changed the fill
 
 
 @dataclass
@@ -126,7 +129,7 @@ def flat_color(color: UInt8, seen: Bool, still: Bool, texel: float) -> Bool | No
 
     Whatever the color (black, orange and white are usual), it is such fill if pieces at least 12
     texels wide in which nothing varies, neither between cells nor within one, cover 0.5 % of the
-    seen cells, and their surroundings differ from them by 8 grey levels or more. Noise keeps real
+    seen cells, and their surroundings differ by 10 grey levels or more, at once. Noise keeps real
     ground from the first, however dark; a smooth gradient or an overexposed area, whose color
     goes over gently into what is around, fails the second.
 
@@ -140,7 +143,8 @@ def flat_color(color: UInt8, seen: Bool, still: Bool, texel: float) -> Bool | No
     Returns
     -------
     (H, W) bool or None
-        The fill with a rim of two texels and a cell, in which it is mixed; None without fill.
+        The fill with a rim of two texels and a cell, in which it is mixed with what is beside it;
+        None without fill.
     """
     from meshreg.raster import finish_kernels
 
@@ -149,9 +153,9 @@ def flat_color(color: UInt8, seen: Bool, still: Bool, texel: float) -> Bool | No
     if np.count_nonzero(calm) < 0.5 * least:
         return None
     counts = finish_kernels.color_counts(color, calm)
-    order = np.argsort(counts, kind="stable")[::-1][:_FLAT_COLORS]
     # Calm cells lack the rim of a piece: hence half of the share here, all of it below.
-    candidates = [int(value) for value in order if counts[value] >= 0.5 * least]
+    candidates = np.flatnonzero(counts >= 0.5 * least)
+    candidates = candidates[np.argsort(-counts[candidates], kind="stable")][:_FLAT_COLORS]
     found = None
     for value in candidates:
         rgb = np.array([value >> 16, value >> 8 & 255, value & 255], np.uint8)
@@ -166,23 +170,43 @@ def _fill_of_color(
 ) -> Bool | None:
     from scipy import ndimage
 
-    width = max(5, math.ceil(_FLAT_TEXELS * texel)) | 1
-    rim = 1 + math.ceil(2 * texel)
-    beyond = rim + max(2, math.ceil(4 * texel))
+    def cells(texels: float) -> int:
+        return math.ceil(texels * texel - 0.01)
 
     def grown(where: Bool, by: int) -> Bool:
         return np.asarray(ndimage.maximum_filter(where, 2 * by + 1, mode="constant"))
 
+    def like(within: Bool, levels: int) -> Bool:
+        found = within & seen
+        found[found] = _steps(color[found], rgb) <= levels
+        return found
+
     same = still & seen & (color == rgb).all(axis=2)
+    width = max(5, cells(_FLAT_TEXELS)) | 1
     core = ndimage.minimum_filter(same, width, mode="constant")
-    pieces = ndimage.maximum_filter(core, width, mode="constant")
+    pieces = np.asarray(ndimage.maximum_filter(core, width, mode="constant"))
     if np.count_nonzero(pieces) < least:
         return None
-    around = grown(pieces, beyond) & ~grown(pieces, rim) & seen
-    steps = np.abs(color[around].astype(np.int16) - rgb).max(axis=1)
-    if not len(steps) or np.median(steps) < _FLAT_STEP:
+    rim = 1 + cells(2)
+    fringe = grown(pieces, 1 + cells(_BLOCK_TEXELS))
+    base = pieces | like(fringe, _FLAT_STEP - 2)
+    near, far = (
+        grown(base, by + 1 + cells(2)) & ~grown(base, by) & seen
+        for by in (rim, rim + 1 + cells(_BLOCK_TEXELS))
+    )
+    if not near.any():
         return None
-    return grown(pieces, rim)
+    step = float(np.median(_steps(color[near], rgb)))
+    beyond = float(np.median(_steps(color[far], rgb))) if far.any() else step
+    if step < _FLAT_STEP or step < _ABRUPT * beyond:
+        return None
+    # JPEG mixes a block that lies across the border: take in what is there and much alike.
+    return grown(pieces | like(fringe, _ALIKE), rim)
+
+
+def _steps(colors: UInt8, rgb: UInt8) -> NDArray[np.int16]:
+    """Largest difference among red, green and blue of colors (N, 3) to one."""
+    return np.asarray(np.abs(colors.astype(np.int16) - rgb).max(axis=1))
 
 
 def _mask_on(

@@ -50,8 +50,8 @@ def survey_grid(
         `reference_from_moving`: the grid is to hold the moved survey.
     """
     lattice = cell if lattice is None else lattice
-    times = round(lattice / cell)
-    if not (cell > 0 and times >= 1 and abs(times * cell - lattice) <= 1e-9 * lattice):
+    times = round(lattice / cell) if cell > 0 else 0
+    if not (times >= 1 and abs(times * cell - lattice) <= 1e-9 * lattice):
         raise UsageError(
             f"The lattice of {lattice} m is no multiple of the cell of {cell} m.",
             remedy="Give a positive cell, and a lattice that it divides.",

@@ -73,11 +73,19 @@ def draw_scene(registration: Registration, path: Path, seconds: float) -> Path |
             _LOG.info("No 3-D still: %s", error)
             return None
         if done.returncode != 0 or not picture.exists():
-            last = (done.stderr.strip().splitlines() or [f"exit code {done.returncode}"])[-1]
-            _LOG.info("No 3-D still: this machine cannot render (%s); see `meshreg doctor`.", last)
+            _LOG.info(
+                "No 3-D still: this machine cannot render it (%s); see `meshreg doctor`.",
+                _death(done.returncode, done.stderr),
+            )
             return None
         _save(np.load(picture), path)
     return path
+
+
+def _death(code: int, said: str) -> str:
+    if code < 0:
+        return f"the child was killed by signal {-code}"
+    return (said.strip().splitlines() or [f"exit code {code}"])[-1]
 
 
 def _save(picture: Any, path: Path) -> None:

@@ -169,7 +169,9 @@ def test_degrees_become_metres(tmp_path):
 def test_feet_become_metres_heights_too(tmp_path):
     feet = np.array([[637_000.0, 851_000, 450], [637_100, 851_000, 460], [637_000, 851_100, 470]])
     made(tmp_path / "a.las", feet, crs="EPSG:2992")
-    points = absolute(read_survey(tmp_path / "a.las"))
+    survey = read_survey(tmp_path / "a.las")
+    assert "taken in 0.3048 m, too" in survey.notes[-1]
+    points = absolute(survey)
     assert points[:, 2] == pytest.approx([137.16, 140.208, 143.256])
     lengths = np.linalg.norm(points[1:, :2] - points[0, :2], axis=1)
     assert lengths == pytest.approx([30.48, 30.48], rel=1e-3)

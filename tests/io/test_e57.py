@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from meshreg.errors import InputError, OutputError, UnsafeReferenceError, UsageError
-from meshreg.io import e57, e57_scans, e57_xml
+from meshreg.io import e57, e57_pages, e57_scans, e57_xml
 from meshreg.io.mover import make_mover
 from meshreg.io.options import ReadOptions
 from meshreg.types import Frame, Mesh, PointCloud, Survey, Transform
@@ -324,11 +324,16 @@ def test_doctype_does_not_hide_in_another_encoding(tmp_path, points, encoding):
         e57.read(path, ReadOptions())
 
 
-def test_other_declared_encoding_is_refused(tmp_path, points):
+@pytest.mark.parametrize("padding", [b"", b" " * 5000])
+def test_other_declared_encoding_is_refused(tmp_path, points, padding):
     path = e57_file(tmp_path / "a.e57", [{"columns": xyz_columns(points)}])
+    layout = e57_xml.read_layout(path)
+    xml = layout.xml.replace(b'encoding="UTF-8"', padding + b'encoding="UTF-7"')
     data = path.read_bytes()
-    plain = b"".join(data[i : i + 1020] for i in range(0, len(data), 1024))
-    path.write_bytes(pages(plain.replace(b'encoding="UTF-8"', b'encoding="UTF-7"')))
+    before = b"".join(data[i : i + 1020] for i in range(0, len(data), 1024))[: layout.xml_start]
+    new = pages(before + xml)
+    head = struct.pack("<QQQ", len(new), physical(layout.xml_start), len(xml))
+    path.write_bytes(pages(before[:16] + head + before[40:] + xml))
     with pytest.raises(InputError, match="utf-7"):
         e57.read(path, ReadOptions())
 
@@ -408,8 +413,8 @@ def test_checksums_of_real_pages():
     data = (DATA / "tiny_spherical.e57").read_bytes()
     for start in range(0, len(data), 1024):
         page = data[start : start + 1020]
-        assert e57_xml.page_checksum(page) == data[start + 1020 : start + 1024]
-        assert e57_xml.page_checksum(page) == struct.pack(">I", crc32c(page))
+        assert e57_pages.page_checksum(page) == data[start + 1020 : start + 1024]
+        assert e57_pages.page_checksum(page) == struct.pack(">I", crc32c(page))
 
 
 def turn(angle: float, axis: str) -> np.ndarray:
@@ -518,6 +523,18 @@ def test_intensity_survives_a_stretch(tmp_path, points):
     with e57_scans.opened(out) as (libe57, file):
         pieces = list(e57_scans.pieces(libe57, file, 0, scan, out, ("intensity",)))
     np.testing.assert_array_equal(pieces[0].extra["intensity"], bright)
+
+
+def test_rewrite_refuses_a_file_that_has_changed(tmp_path, points):
+    path, _, _ = two_scans(tmp_path / "a.e57", points)
+    survey = e57.read(path, ReadOptions())
+    two_scans(path, points + 1)
+    path.touch()
+    with pytest.raises(InputError, match="has changed"):
+        e57.rewrite(
+            survey.source[0], make_mover(survey.source[0], MOVE, Frame()), tmp_path / "o.e57"
+        )
+    assert not (tmp_path / "o.e57").exists()
 
 
 def test_a_wrong_result_is_not_kept(tmp_path, points, monkeypatch):

@@ -569,6 +569,16 @@ def test_rewrite_moves_the_surface(tmp_path, turn, scale):
     assert grid.cell == found.height_grid.cell
 
 
+def test_rewrite_refuses_a_file_that_has_changed(tmp_path):
+    survey = pair(tmp_path)
+    with open(tmp_path / "a.tif", "ab") as stream:
+        stream.write(b"more")
+    move = move_of(survey, Transform(), survey.source[0].frame)
+    with pytest.raises(InputError, match="has changed"):
+        maps.rewrite(survey.source[0], move, tmp_path / "moved.tif")
+    assert not (tmp_path / "moved.tif").exists()
+
+
 def test_whole_cells_move_without_any_loss(tmp_path):
     """A shift by whole cells must give back the same numbers, and its inverse the same file."""
     survey = pair(tmp_path)

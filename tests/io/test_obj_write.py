@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import resource
 from decimal import Decimal
 
 import numpy as np
@@ -398,6 +399,27 @@ def test_a_source_that_changed_is_refused(tmp_path):
     with pytest.raises(InputError, match="changed"):
         rewrite(source, mover, tmp_path / "out.obj")
     assert os.listdir(tmp_path) == ["reef.obj"]
+
+
+def test_a_full_disk_leaves_what_was_there(tmp_path):
+    mesh = grid_mesh(60, 60)
+    path, moved = tmp_path / "reef.obj", tmp_path / "moved.obj"
+    write(Survey("reef", mesh), path)
+    source = source_of(path)
+    before = path.read_bytes()
+    moved.write_text("old")
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, hard))
+    try:
+        with pytest.raises(OutputError, match="intact"):
+            write(Survey("reef", mesh), path)
+        with pytest.raises(OutputError, match="intact"):
+            rewrite(source, make_mover(source, TURN, Frame()), moved)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert path.read_bytes() == before
+    assert moved.read_text() == "old"
+    assert sorted(os.listdir(tmp_path)) == ["moved.obj", "reef.obj"]
 
 
 def test_a_file_is_not_moved_onto_itself(tmp_path):

@@ -95,6 +95,10 @@ def test_longitude_and_latitude_become_metres(tmp_path):
     # WGS 84 is flatter by so little that it shows in a tenth of a millimetre.
     assert absolute(survey) == pytest.approx(np.array(expected), rel=0, abs=1e-3)
     assert read_survey(path, crs="EPSG:7844").crs == "EPSG:7854"
+    (tmp_path / "a.prj").write_text("EPSG:7844")
+    said = read_survey(path)
+    assert said.crs == "EPSG:7854"
+    assert not any("EPSG:4326" in note for note in said.notes)
 
 
 # --- colours

@@ -143,7 +143,7 @@ def test_millimetre_points_get_finer_cells():
 
 def test_a_cloud_gets_two_points_to_a_cell_of_its_orthomosaic():
     cells = cells_of(cloud(0.2, size=60, colors=True))
-    assert (cells.dem, cells.ortho, cells.sift) == (0.5, 0.25, 0.25)
+    assert (cells.dem, cells.ortho, cells.sift) == (0.6, 0.3, 0.3)
 
 
 def test_cells_nest_so_that_one_raster_can_be_averaged():

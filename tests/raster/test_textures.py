@@ -55,25 +55,29 @@ def test_a_cell_of_several_texels_takes_their_mean(factor):
     assert raster.color_valid.all()
 
 
-def test_a_gradient_gives_back_a_shift_of_a_hundredth_of_a_cell():
-    ramp = np.broadcast_to(np.arange(200)[None, :, None], (200, 200, 3)).astype(np.uint8)
-    for shift in (0.0, 0.01, 0.33, -0.47):
-        # 1 grey level a texel of 0.1 m, sampled on cells of 0.2 m that lie `shift` m further east.
-        grid = Grid(4.0 + shift, 16.0, 0.2, (60, 60))
-        raster = rasterize(draped(ramp, 20.0, 20.0), grid, PLAIN)
-        rows, cols = np.indices(grid.shape)
-        east, _ = grid.east_north(rows, cols)
-        truth = east / 0.1 - 0.5
-        assert abs((raster.color[..., 0] - truth).mean()) <= 0.5  # rounding to whole levels
-        # Rounding is the same for all cells here, so read the shift from a finer ramp too:
-    fine = np.zeros((8, 2000, 3), np.uint8)
-    fine[..., 0] = np.arange(2000) % 250
-    grid = Grid(0.3 + 0.0123, 0.8, 0.05, (10, 20))
-    raster = rasterize(draped(fine, 2.0, 0.8), grid, PLAIN)
-    _, cols = np.indices(grid.shape)
-    truth = (grid.west + (cols + 0.5) * 0.05) / 0.001 - 0.5
-    smooth = (truth % 250 > 30) & (truth % 250 < 219)
-    assert np.abs(raster.color[..., 0] - truth % 250)[smooth].max() <= 0.51
+@pytest.mark.parametrize("cell", [0.05, 0.1, 0.02, 0.01, 0.3])
+@pytest.mark.parametrize("offset", [(0.0, 0.0), (0.0123, -0.0077), (-0.0049, 0.0021)])
+def test_a_smooth_picture_lies_within_a_hundredth_of_a_cell_or_texel(cell, offset):
+    """Half texel and half cell exactly: the least-squares shift against the formula is nil."""
+
+    def picture(east, north):
+        return 120 + 60 * np.sin(3.1 * east + 0.3) + 60 * np.cos(2.3 * north - 0.2 * east)
+
+    texel = 0.025
+    row, col = np.indices((160, 160))
+    image = np.repeat(picture((col + 0.5) * texel, 4 - (row + 0.5) * texel)[..., None], 3, axis=2)
+    count = int(3.4 / cell)
+    grid = Grid(0.2 + offset[0], 3.7 + offset[1], cell, (count, count))
+    raster = rasterize(draped(np.round(image), 4.0, 4.0), grid, PLAIN)
+    rows, cols = np.indices(grid.divided(8).shape)
+    fine = picture(*grid.divided(8).east_north(rows, cols))
+    truth = fine.reshape(count, 8, count, 8).mean(axis=(1, 3))
+    error = raster.color[..., 0] - truth
+    assert np.abs(error).max() <= 1.2  # rounding of texels and of cells, half a level each
+    north, east = np.gradient(truth)
+    design = np.stack([east.ravel(), north.ravel()], axis=1)
+    shift = np.linalg.lstsq(design, error.ravel(), rcond=None)[0]
+    assert np.abs(shift).max() * cell <= 0.01 * max(cell, texel)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,150 @@
+"""Rasterizing against Open3D's ray casting with a NumPy texture look-up, and the clouds' rate.
+
+Both sides get the same mesh and texture in memory, and answer with one sample a cell (height and
+color) on the same grid; meshreg's default, which takes four or more samples a cell, stands beside.
+"""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+
+from meshreg.raster import rasterize
+from meshreg.raster.mesh import draw_mesh
+from meshreg.raster.placing import place
+from meshreg.raster.spacing import measure_spacing
+from meshreg.settings import RasterSettings
+from meshreg.types import Grid, Mesh, PointCloud, Survey, Texture
+
+
+def textured_reef(faces: int, page: int, size: float) -> Survey:
+    """A sheet of `faces` irregular triangles, `size` m wide, under one page of `page`² texels."""
+    count = int(np.sqrt(faces / 2)) + 1
+    rng = np.random.default_rng(0)
+    axis = np.linspace(0.0, size, count)
+    x, y = np.meshgrid(axis, axis)
+    step = size / (count - 1)
+    x[1:-1, 1:-1] += rng.uniform(-0.35, 0.35, (count - 2, count - 2)) * step
+    y[1:-1, 1:-1] += rng.uniform(-0.35, 0.35, (count - 2, count - 2)) * step
+    z = 0.3 * np.sin(1.3 * x) * np.cos(0.9 * y) + 0.05 * np.sin(11 * x + 7 * y)
+    z += rng.normal(0, 0.2 * step, z.shape)
+    index = np.arange(count * count).reshape(count, count)
+    a, b = index[:-1, :-1].ravel(), index[:-1, 1:].ravel()
+    c, d = index[1:, 1:].ravel(), index[1:, :-1].ravel()
+    corners = np.stack([np.stack([a, b, c], 1), np.stack([a, c, d], 1)], axis=1).reshape(-1, 3)
+    image = rng.integers(0, 256, (page, page, 3), dtype=np.uint8)
+    uv = np.stack([x.ravel() / size, y.ravel() / size], axis=1).astype(np.float32)
+    mesh = Mesh(
+        np.stack([x, y, z], axis=-1).reshape(-1, 3),
+        corners.astype(np.int32),
+        uv=uv[corners],
+        face_texture=np.zeros(len(corners), np.int32),
+        textures=(Texture("page", (page, page), lambda: image),),
+    )
+    return Survey("reef", mesh)
+
+
+def by_open3d(mesh: Mesh, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
+    """Height and color of the first hit under each cell's centre: the peer's route."""
+    import open3d
+
+    scene = open3d.t.geometry.RaycastingScene()
+    vertices = open3d.core.Tensor(mesh.vertices.astype(np.float32))
+    scene.add_triangles(vertices, open3d.core.Tensor(mesh.faces.astype(np.uint32)))
+    rows, cols = np.indices(grid.shape)
+    east, north = grid.east_north(rows, cols)
+    top = float(mesh.vertices[:, 2].max()) + 1.0
+    rays = np.zeros((east.size, 6), np.float32)
+    rays[:, 0], rays[:, 1], rays[:, 2], rays[:, 5] = east.ravel(), north.ravel(), top, -1.0
+    hits = scene.cast_rays(open3d.core.Tensor(rays))
+    distance = hits["t_hit"].numpy()
+    hit = np.isfinite(distance)
+    face, weights = hits["primitive_ids"].numpy()[hit], hits["primitive_uvs"].numpy()[hit]
+    assert mesh.uv is not None
+    corners = mesh.uv[face]
+    weights = np.column_stack([1 - weights.sum(axis=1), weights])
+    u, v = np.einsum("nk,nkc->cn", weights, corners)
+    image = mesh.textures[0].load()
+    size = image.shape[0]
+    row = np.clip(((1 - v) * size).astype(int), 0, size - 1)
+    col = np.clip((u * size).astype(int), 0, size - 1)
+    height = np.full(east.size, np.nan, np.float32)
+    color = np.zeros((east.size, 3), np.uint8)
+    height[hit] = top - distance[hit]
+    color[hit] = image[row, col]
+    return height.reshape(grid.shape), color.reshape(*grid.shape, 3)
+
+
+def best_of(times, function):
+    """Least wall time [s] of a few runs, and the last result."""
+    best, result = np.inf, None
+    for _ in range(times):
+        start = time.perf_counter()
+        result = function()
+        best = min(best, time.perf_counter() - start)
+    return best, result
+
+
+def bench(faces: int = 4_000_000, page: int = 8192, cells: int = 4000, points: int = 20_000_000):
+    """Print the table rows; return them as (what, seconds, note)."""
+    rows = []
+    survey, size = textured_reef(faces, page, 40.0), 40.0
+    mesh = survey.geometry
+    assert isinstance(mesh, Mesh)
+    grid = Grid(0.0, size, size / cells, (cells, cells))
+    placing = place(survey, grid, None, np.zeros(1))
+    plain = RasterSettings(fill_cells=0, remove_floaters=False, mask_flat_color=False)
+    small = Grid(0.0, 4.0, 0.04, (100, 100))
+    rasterize(survey, small)  # compile
+
+    def one_sample():
+        return draw_mesh(mesh, placing, grid, measure_spacing(survey), plain, times=1)
+
+    ours, layers = best_of(3, one_sample)
+    megapixels = cells * cells / 1e6
+    rows.append((f"meshreg, 1 sample a cell ({megapixels:.0f} Mpx)", ours, ""))
+    default, raster = best_of(3, lambda: rasterize(survey, grid))
+    least = int(raster.samples.max())
+    rows.append((f"meshreg rasterize, {least} samples a cell, floaters and masks", default, ""))
+    try:
+        theirs, (height, _) = best_of(1, lambda: by_open3d(mesh, grid))
+    except ImportError as error:
+        rows.append(("Open3D RaycastingScene + NumPy", float("nan"), str(error)))
+    else:
+        both = np.isfinite(height) & np.isfinite(layers.height)
+        off = np.abs(height - layers.height - placing.datum)[both]
+        note = f"{theirs / ours:.1f}x and {theirs / default:.1f}x meshreg's time; heights differ "
+        note += f"by over 1e-4 m at {np.mean(off > 1e-4):.1e} of samples"
+        rows.append(("Open3D RaycastingScene + NumPy, 1 ray a cell", theirs, note))
+    rows += bench_clouds(points, size)
+    for what, seconds, note in rows:
+        print(f"{what:62s} {seconds:8.2f} s  {note}")
+    return rows
+
+
+def bench_clouds(points: int, size: float):
+    """Points with color, in random order and along lines as scanners and most exports have them."""
+    rng = np.random.default_rng(1)
+    rows = []
+    for order in ("random order", "in lines"):
+        places = rng.uniform(0, size, (points, 2))
+        if order == "in lines":
+            places = places[np.argsort(np.floor(places[:, 1] / 0.05), kind="stable")]
+        height = 0.3 * np.sin(1.3 * places[:, 0]) + rng.normal(0, 0.004, points)
+        colors = rng.integers(0, 256, (points, 3), dtype=np.uint8)
+        survey = Survey("cloud", PointCloud(np.column_stack([places, height]), colors))
+        grid = Grid(0.0, size, size / 2000, (2000, 2000))
+        for what, settings in (
+            ("", RasterSettings()),
+            (", binning alone", RasterSettings(remove_floaters=False, fill_cells=0)),
+        ):
+            rasterize(survey, Grid(0, 1, 0.5, (2, 2)), settings)
+            seconds, _ = best_of(3, lambda s=settings: rasterize(survey, grid, s))
+            rate = f"{points / seconds / 1e6:.0f} M points/s"
+            rows.append((f"cloud of {points / 1e6:.0f} M, {order}{what}", seconds, rate))
+    return rows
+
+
+if __name__ == "__main__":
+    bench()

@@ -1,0 +1,158 @@
+"""The whole way, on meshes and clouds whose motion is known exactly."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import numpy as np
+import pytest
+import seafloor
+
+from meshreg import Mesh, PointCloud, Settings, Survey, apply_transform, register_pair
+from meshreg.errors import UsageError
+from meshreg.types import Transform
+
+OFFSET = np.array([1.337, -2.412, 0.083])
+QUICK = Settings().changed({"search.radius": 5.0})
+
+
+def survey(floor, half=6.0, step=0.04, seed=0, name="survey", cloud=False):
+    """A jittered grid mesh (or cloud) of bumps, colored per vertex, around (0, 0)."""
+    rng = np.random.default_rng(seed)
+    n = round(2 * half / step)
+    raster = floor.raster(step, half, noise=0.0, seed=seed)
+    row, col = np.mgrid[0:n, 0:n]
+    east, north = raster.grid.east_north(row, col)
+    # heights noisy by a millimetre; the places stay on the lattice, where the bumps were summed
+    up = raster.height + rng.normal(0, 0.001, raster.height.shape)
+    points = np.stack([east, north, up], axis=-1).reshape(-1, 3)
+    colors = raster.color.reshape(-1, 3)
+    if cloud:
+        return Survey(name, PointCloud(points, colors))
+    index = np.arange(n * n).reshape(n, n)
+    a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]
+    faces = np.concatenate(
+        [np.stack([a, c, b], -1).reshape(-1, 3), np.stack([b, c, d], -1).reshape(-1, 3)]
+    )
+    return Survey(name, Mesh(points, faces, colors))
+
+
+@functools.cache
+def floors(change=0.2):
+    floor = seafloor.Seafloor.random(11, size=18.0)
+    return floor, floor.changed(12, change)
+
+
+def displaced(before, yaw=0.0, at=(0.0, 0.0, 0.0)):
+    """Deliver a survey with the inverse of a known reference_from_moving."""
+    c, s = np.cos(yaw), np.sin(yaw)
+    rotation = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    truth = Transform(rotation, 1.0, OFFSET, at)
+    return apply_transform(before, truth.inverse()), truth
+
+
+def errors(registration, truth, points):
+    return np.abs(registration.transform.apply(points) - truth.apply(points))
+
+
+@pytest.mark.parametrize("yaw_deg", [0.0, 0.6])
+@pytest.mark.parametrize("cloud", [False, True])
+def test_known_motion_is_recovered_both_ways(cloud, yaw_deg):
+    first, later = floors()
+    reference = survey(first, seed=1, name="first", cloud=cloud)
+    moving, truth = displaced(survey(later, seed=2, name="later", cloud=cloud), np.deg2rad(yaw_deg))
+    there = register_pair(reference, moving, QUICK)
+    assert there.verdict == "accepted", there.reason
+    low, high = moving.bounds
+    corners = np.array([[x, y, 0.0] for x in (low[0], high[0]) for y in (low[1], high[1])])
+    assert errors(there, truth, moving.centre)[:2].max() < 0.01
+    assert errors(there, truth, corners)[:, :2].max() < 0.03
+    assert errors(there, truth, corners)[:, 2].max() < 0.01
+    # the stated covariance covers, and does not hide behind a barn door
+    sigma = np.sqrt(np.diag(there.covariance))
+    assert (sigma[:3] < 0.02).all()
+    back = register_pair(moving, reference, QUICK)
+    assert back.verdict == "accepted", back.reason
+    home = back.transform.apply(there.transform.apply(corners))
+    assert np.abs(home - corners).max() < 0.03
+
+
+def test_a_survey_onto_itself_stays():
+    reference = survey(floors()[0], half=5.0)
+    registration = register_pair(reference, reference, QUICK)
+    assert registration.verdict == "accepted"
+    matrix = registration.transform.matrix
+    assert np.abs(matrix - np.eye(4)).max() < 2e-4
+
+
+def test_large_coordinates_change_nothing():
+    """The same pair near (0, 0) and at southern UTM size: one answer, to 0.1 mm."""
+    first, later = floors()
+    reference = survey(first, half=5.0)
+    moving, _ = displaced(survey(later, half=5.0, seed=3))
+    near = register_pair(reference, moving, QUICK)
+    far_away = np.array([512_345.0, 8_388_700.0, -1800.0])
+    far = register_pair(
+        *(dataclasses.replace(s, origin=s.origin + far_away) for s in (reference, moving)), QUICK
+    )
+    assert far.verdict == near.verdict == "accepted"
+    np.testing.assert_allclose(far.transform.offset, near.transform.offset, atol=1e-4)
+
+
+def test_evidence_for_the_report_is_on_common_grids():
+    first, later = floors()
+    reference = survey(first, half=5.0)
+    moving, _ = displaced(survey(later, half=5.0, seed=3))
+    evidence = register_pair(reference, moving, QUICK).evidence
+    for kind in ("dem", "ortho"):
+        grids = {evidence[f"{which}_{kind}"].grid for which in ("reference", "moving")}
+        grids.add(evidence[f"moving_{kind}_before"].grid)
+        assert len(grids) == 1
+    # after registration the heights agree to what changed; before, to the relief
+    pair = evidence["reference_dem"], evidence["moving_dem"], evidence["moving_dem_before"]
+    both = pair[0].valid & pair[1].valid
+    after = pair[0].height + pair[0].datum - pair[1].height - pair[1].datum
+    assert abs(np.median(after[both])) < 1e-6
+    assert np.percentile(np.abs(after[both]), 50) < 0.02
+
+
+def test_surveys_kilometres_apart_are_rejected_without_rasterizing_the_sea_between():
+    reference = survey(floors()[0], half=3.0)
+    moving = dataclasses.replace(reference, origin=np.array([731_000.0, 5_705_000.0, 0.0]))
+    registration = register_pair(reference, moving, QUICK)
+    assert registration.verdict == "rejected"
+    assert registration.transform is None
+    assert "--moving-shift" in registration.reason
+    assert "rasterize" not in registration.seconds
+
+
+def test_same_seed_same_document():
+    first, later = floors()
+    reference = survey(first, half=4.0)
+    moving, _ = displaced(survey(later, half=4.0, seed=3))
+    runs = [register_pair(reference, moving, QUICK) for _ in range(2)]
+    np.testing.assert_array_equal(runs[0].transform.matrix, runs[1].transform.matrix)
+    np.testing.assert_array_equal(runs[0].covariance, runs[1].covariance)
+
+
+def test_misuse_names_the_remedy():
+    reference = survey(floors()[0], half=2.0)
+    other_crs = dataclasses.replace(reference, crs="EPSG:32755")
+    with pytest.raises(UsageError, match="common_crs"):
+        register_pair(dataclasses.replace(reference, crs="EPSG:32754"), other_crs)
+    with pytest.raises(UsageError, match="--scale"):
+        register_pair(reference, dataclasses.replace(reference, scale_known=False))
+    with pytest.raises(UsageError, match="'magic'"):
+        register_pair(reference, reference, Settings(methods=("magic",)))
+
+
+def test_progress_names_each_stage_once_begun_and_once_done():
+    told = []
+    reference = survey(floors()[0], half=4.0)
+    register_pair(reference, reference, QUICK, progress=lambda *word: told.append(word))
+    for stage in ("rasterize", "sift", "terrain", "mutual_information", "judge", "apply"):
+        fractions = [f for s, f in told if s == stage]
+        assert fractions[0] == 0.0
+        assert fractions[-1] == 1.0
+        assert fractions == sorted(fractions)
