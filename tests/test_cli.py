@@ -18,6 +18,7 @@ import jsonschema
 import numpy as np
 import pytest
 from made_registration import made_registration
+from PIL import Image
 from rich.console import Console
 
 import meshreg
@@ -85,7 +86,12 @@ def verdict(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], dict[str, Any]]:
                 rest["progress"](stage, 0.0)
                 rest["progress"](stage, 1.0)
             logging.getLogger("meshreg").warning("a [bold]loud[/bold] word")
-            return dataclasses.replace(made_registration(name), settings=settings.as_dict())
+            return dataclasses.replace(
+                made_registration(name),
+                settings=settings.as_dict(),
+                reference=meshreg.pipeline._about(reference),
+                moving=meshreg.pipeline._about(moving),
+            )
 
         monkeypatch.setattr(meshreg.pipeline, "register_pair", register_pair)
         return asked
@@ -505,6 +511,27 @@ def test_apply_moves_a_further_file(
     np.testing.assert_allclose(moved[:, :3], transform.apply(points), atol=2e-3)
 
 
+def test_apply_writes_in_the_reference_files_axes(
+    tmp_path: Path, pair: tuple[str, str], run: Run, verdict: Any
+) -> None:
+    verdict("accepted")
+    out = tmp_path / "out"
+    code, _, error = run("register", *pair, "-o", out, "--axes", "ned")
+    assert code == 0, error
+    # The same file again: `apply` knows the axes and shift of the reference from the record only.
+    code, _, error = run("apply", out, pair[1], "-o", tmp_path / "moved", "--axes", "ned")
+    assert code == 0, error
+    again = (tmp_path / "moved" / "new_registered.obj").read_bytes()
+    assert again == (out / "new_registered.obj").read_bytes()
+    first = Path(pair[1]).read_text().split()[1:4]
+    x, y, z = (float(word) for word in first)
+    transform = made_registration().transform
+    assert transform is not None
+    east, north, up = transform.apply([y, x, -z])  # north, east, down
+    moved = [float(word) for word in again.decode().split()[1:4]]
+    np.testing.assert_allclose(moved, [north, east, -up], atol=1e-5)
+
+
 def test_apply_refuses_a_rejected_registration(
     tmp_path: Path, pair: tuple[str, str], run: Run, verdict: Any
 ) -> None:
@@ -681,3 +708,122 @@ def test_bars_on_a_terminal() -> None:
     said = voice.err.export_text()
     assert "matching image features" in said
     assert "100%" in said
+
+
+# ---- the real thing, on the pair that the package carries ---------------------------------------
+
+TRUTH = np.array([13.4, -8.7, 1.25])
+DEMO = Path(meshreg.__file__).parent / "demo_data"
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
+    """The demonstration as a user runs it, in a process of its own."""
+    out = tmp_path_factory.mktemp("demo") / "out"
+    command = [sys.executable, "-m", "meshreg", "demo", "-o", str(out), "--json"]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=False)
+    assert done.returncode == 0, done.stderr + done.stdout
+    assert done.stderr == ""
+    return out, json.loads(done.stdout)
+
+
+def test_demo_finds_the_known_offset(demo: tuple[Path, dict[str, Any]]) -> None:
+    out, document = demo
+    jsonschema.validate(document, SCHEMA)
+    assert document["verdict"] == "accepted"
+    found = np.array([document["offset"][key] for key in ("east", "north", "up")])
+    assert np.abs(found[:2] - TRUTH[:2]).max() < 2.0
+    assert abs(found[2] - TRUTH[2]) < 0.5  # the sand moved too
+    assert document["after"]["height_nmad"] < 0.3 * document["before"]["height_nmad"]
+    names = {path.name for path in out.iterdir()}
+    assert names >= {
+        "registration.json", "beach_2019_registered.obj", "transform.txt", "transform_inverse.txt",
+        "transform_global.txt", "reference_dem.tif", "moving_dem.tif", "reference_ortho.tif",
+        "moving_ortho.tif", "figures", "settings.toml", "log.txt",
+    }  # fmt: skip
+    figures = {path.stem for path in (out / "figures").iterdir()}
+    assert figures >= {"extents", "orthos", "relief", "section", "offsets", "height_difference"}
+
+
+def test_demo_moves_every_vertex_and_keeps_the_texture(demo: tuple[Path, dict[str, Any]]) -> None:
+    out, document = demo
+    matrix = np.array(document["transform"]["reference_from_moving"])
+
+    def vertices(path: Path) -> np.ndarray:
+        lines = path.read_text().splitlines()
+        return np.array([line.split()[1:4] for line in lines if line.startswith("v ")], float)
+
+    before, after = vertices(DEMO / "beach_2019.obj"), vertices(out / "beach_2019_registered.obj")
+    expected = before @ matrix[:3, :3].T + matrix[:3, 3]
+    np.testing.assert_allclose(after, expected, atol=1e-5)
+    rows = [
+        [line for line in path.read_text().splitlines() if not line.startswith("v ")]
+        for path in (DEMO / "beach_2019.obj", out / "beach_2019_registered.obj")
+    ]
+    assert rows[0] == rows[1]
+    survey = meshreg.read_survey(out / "beach_2019_registered.obj")
+    assert isinstance(survey.geometry, Mesh)
+    with Image.open(DEMO / "beach_2019.jpg") as page:
+        assert survey.geometry.textures[0].size == page.size
+        np.testing.assert_array_equal(survey.geometry.textures[0].load(), np.asarray(page))
+
+
+def test_demo_record_applies_to_its_own_survey(
+    demo: tuple[Path, dict[str, Any]], tmp_path: Path, run: Run
+) -> None:
+    out, _ = demo
+    code, _, error = run("apply", out, DEMO / "beach_2019.obj", "-o", tmp_path / "again")
+    assert code == 0, error
+    again = (tmp_path / "again" / "beach_2019_registered.obj").read_bytes()
+    assert again == (out / "beach_2019_registered.obj").read_bytes()
+
+
+def test_same_seed_gives_the_same_answer(
+    demo: tuple[Path, dict[str, Any]], tmp_path: Path, run: Run
+) -> None:
+    _, first = demo
+    code, said, _ = run("demo", "-o", tmp_path / "out", "--json")
+    second = json.loads(said)
+    assert code == 0
+    assert second["offset"] == first["offset"]
+    assert second["covariance"] == first["covariance"]
+    assert [m["offset"] for m in second["methods"].values()] == [
+        m["offset"] for m in first["methods"].values()
+    ]
+
+
+def test_surveys_of_different_places_are_rejected(tmp_path: Path, run: Run) -> None:
+    pair = DEMO / "beach_2018.obj", DEMO / "beach_2019.obj"
+    code, said, _ = run("register", *pair, "-o", tmp_path / "o", "--moving-shift", "900,0,0")
+    assert code == 4
+    assert "REJECTED" in said
+    assert "--moving-shift" in said
+    names = {path.name for path in (tmp_path / "o").iterdir()}
+    assert names == {"registration.json", "settings.toml", "log.txt", "figures"}
+    assert {path.stem for path in (tmp_path / "o" / "figures").iterdir()} == {"extents"}
+
+
+def test_missing_texture_is_said_loudly(tmp_path: Path, run: Run) -> None:
+    for name in ("beach_2019.obj", "beach_2019.mtl"):
+        (tmp_path / name).write_bytes((DEMO / name).read_bytes())
+    code, _, error = run(
+        "register", DEMO / "beach_2018.obj", tmp_path / "beach_2019.obj", "-o", tmp_path / "o",
+        "--search-radius", 20,
+    )  # fmt: skip
+    assert code in (0, 4)
+    assert "beach_2019.jpg" in error
+    document = json.loads((tmp_path / "o" / "registration.json").read_text())
+    assert document["methods"]["sift"]["status"] == "failed"
+    assert "beach_2019.jpg" in " ".join(document["moving"]["notes"])
+
+
+def test_truncated_ply_names_the_place(tmp_path: Path, run: Run) -> None:
+    whole = tmp_path / "whole.ply"
+    meshreg.write_survey(meshreg.read_survey(DEMO / "beach_2018.obj"), whole)
+    content = whole.read_bytes()
+    (tmp_path / "cut.ply").write_bytes(content[: len(content) // 2])
+    code, _, error = run("register", tmp_path / "cut.ply", whole, "-o", tmp_path / "o")
+    assert code == 3
+    assert "cut.ply" in error
+    assert "byte" in error
+    assert not (tmp_path / "o").exists()

@@ -71,7 +71,7 @@ def test_record_without_evidence_gets_the_offsets_only(
         evidence={},
         estimates=tuple(dataclasses.replace(e, evidence={}) for e in accepted.estimates),
     )
-    assert [path.stem for path in draw_figures(bare, tmp_path)] == ["offsets"]
+    assert [path.stem for path in draw_figures(bare, tmp_path)] == ["extents", "offsets"]
 
 
 def test_a_figure_that_fails_is_left_out_and_said(
@@ -81,6 +81,7 @@ def test_a_figure_that_fails_is_left_out_and_said(
     broken = dataclasses.replace(accepted, evidence=parts | {"residuals": {"east": np.zeros(2)}})
     files = draw_figures(broken, tmp_path, scene_seconds=0)
     assert {path.stem for path in files} == {
+        "extents",
         "offsets",
         "scores_terrain",
         "scores_mutual_information",
@@ -245,6 +246,24 @@ def test_overlay_is_grey_only_where_both_agree(accepted: Registration) -> None:
     ]
     assert [axes.get_title() for axes in figure.axes] == ["before", "after"]
     assert colour[1] < 0.1 * colour[0]
+
+
+def test_extents_are_the_boxes_of_the_record(accepted: Registration) -> None:
+    axes = overlays.draw_extents(accepted).axes[0]
+    labels = (axes.get_xlabel(), axes.get_ylabel())  # "east − 731 500 [m]"
+    corner = [float(text.split("−")[1].split("[")[0].replace("\u2009", "")) for text in labels]
+    lines = {line.get_label(): np.array(line.get_data()) for line in axes.lines}
+    low, high = np.array([[EAST, NORTH], [EAST + 24, NORTH + 26]]) - corner
+    for name in ("reference", "moving"):
+        np.testing.assert_allclose(lines[name].min(axis=1), low)
+        np.testing.assert_allclose(lines[name].max(axis=1), high)
+    # A turn by YAW widens the box by about its half side times YAW; the offset shifts it.
+    moved = lines["moving, registered"]
+    np.testing.assert_allclose(
+        moved.mean(axis=1) - lines["moving"].mean(axis=1), OFFSET[:2], atol=0.2
+    )
+    rejected = overlays.draw_extents(made_registration("rejected"))
+    assert len(rejected.axes[0].lines) == 2
 
 
 # ---- the parts --------------------------------------------------------------------------------

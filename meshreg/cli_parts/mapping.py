@@ -72,13 +72,12 @@ def rasterize(request: RasterizeRequest, voice: Voice, unfinished: Unfinished) -
                 "masked": dict(raster.masked),
             }
         progress("rasterize", 1.0)
-    notes = [*survey.notes, *cells.notes]
     return {
         "schema": "meshreg.maps/1",
         "survey": survey.name,
         "crs": survey.crs,
         "maps": maps,
-        "notes": notes,
+        "notes": list(survey.notes),
     }
 
 

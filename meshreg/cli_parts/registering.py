@@ -43,7 +43,7 @@ def register(request: RegisterRequest, voice: Voice, unfinished: Unfinished) -> 
     """Run the main job: read, register, write OUT whole."""
     from meshreg.io import same_files, unchanged
     from meshreg.io.frames import common_crs
-    from meshreg.io.record import write_record_files
+    from meshreg.io.record import with_frames, write_record_files
     from meshreg.pipeline import register_pair
     from meshreg.report import draw_figures
 
@@ -79,7 +79,7 @@ def register(request: RegisterRequest, voice: Voice, unfinished: Unfinished) -> 
         for survey in (reference, moving):
             unchanged(survey)
         registration = dataclasses.replace(
-            registration,
+            with_frames(registration, reference, moving),
             notes=(*registration.notes, *notes),
             seconds={"read": reading, **registration.seconds},
         )

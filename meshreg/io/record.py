@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ __all__ = [
     "reference_stand_in",
     "registration_document",
     "to_json",
+    "with_frames",
     "write_record_files",
     "write_registration",
 ]
@@ -73,6 +75,7 @@ def write_record_files(
     """Write what `write_registration` does into a folder that is there (and not yet final)."""
     import tomli_w
 
+    registration = with_frames(registration, reference, moving)
     written = [_write_text(folder / "settings.toml", tomli_w.dumps(dict(registration.settings)))]
     written += _write_maps(registration, folder)
     transform = registration.transform
@@ -88,6 +91,27 @@ def write_record_files(
     text = to_json(registration_document(registration))
     written.append(_write_text(folder / "registration.json", text))
     return tuple(written)
+
+
+def with_frames(
+    registration: Registration, reference: Survey | None, moving: Survey | None
+) -> Registration:
+    """Return the record with the axes and the CRS of both surveys' first files.
+
+    Without them `meshreg apply` could not write a further file in the reference's coordinates.
+    """
+
+    def entry(said: Mapping[str, Any], survey: Survey | None) -> dict[str, Any]:
+        if survey is None or not survey.source:
+            return dict(said)
+        frame = survey.source[0].frame
+        return {**said, "axes": frame.axes.tolist(), "file_crs": frame.file_crs}
+
+    return replace(
+        registration,
+        reference=entry(registration.reference, reference),
+        moving=entry(registration.moving, moving),
+    )
 
 
 def _write_text(path: Path, text: str) -> Path:

@@ -131,6 +131,15 @@ class Correlator:
         rows, cols = self.window.rows % size[0], self.window.cols % size[1]
         return np.asarray(whole[np.ix_(rows, cols)], np.float64)
 
+    def many(self, a: Complex, b: Any) -> Any:
+        """``sum_r a[r + s] b_k[r]`` for several b_k at once; `b` holds their conjugates (B, ...)."""
+        from scipy.fft import irfft2
+
+        size = self.window.padded
+        whole = irfft2(a[None] * b, s=size, axes=(1, 2), workers=WORKERS)
+        rows, cols = self.window.rows % size[0], self.window.cols % size[1]
+        return whole[:, rows[:, None], cols[None, :]]
+
     def counts(self, a: Complex, b: Complex) -> Float64:
         """Like `sums`, of two masks: whole numbers."""
         return np.rint(self.sums((a, b)))

@@ -58,3 +58,13 @@ def _information(joint: Any, bins: int) -> float:
     if total == 0:
         return 0.0
     return float((joint_sum - marginal_sum) / total + np.log(total))
+
+
+@jit(parallel=True, nogil=True)
+def add_looked_up(total: Any, counts: Any, table: Any) -> None:
+    """Add ``sum over b of table[round(counts[b])]`` to each cell of `total`."""
+    rows, cols = total.shape
+    for i in prange(rows):
+        for b in range(counts.shape[0]):
+            for j in range(cols):
+                total[i, j] += table[max(int(counts[b, i, j] + 0.5), 0)]

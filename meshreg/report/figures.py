@@ -16,6 +16,7 @@ _LOG = logging.getLogger("meshreg")
 
 # File name and how it is drawn; a function returns None where the record has nothing to show.
 FIGURES: dict[str, Callable[[Registration], Any]] = {
+    "extents": overlays.draw_extents,
     "orthos": overlays.draw_orthos,
     "relief": overlays.draw_relief,
     "section": overlays.draw_section,
@@ -34,7 +35,7 @@ def draw_figures(
     Parameters
     ----------
     registration : Registration
-        With its evidence (one that was read from JSON has none, and gets the offsets only).
+        With its evidence (one that was read from JSON has none, and gets offsets and extents only).
     folder : path
         Made if absent.
     scene_seconds : float

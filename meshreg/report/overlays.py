@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from meshreg.report import style
-from meshreg.types import Registration, SurveyRaster
+from meshreg.types import Grid, Registration, SurveyRaster
 
 
 def draw_relief(registration: Registration) -> Any:
@@ -105,6 +105,43 @@ def draw_orthos(registration: Registration) -> Any:
     axes.imshow(style.over_white(board), extent=place.extent(grid), interpolation="nearest")
     axes.set_title(f"fields by turns from each survey, {stages[-1][0]}", fontsize=10)
     place.label(axes, inner=True)
+    return figure
+
+
+def draw_extents(registration: Registration) -> Any:
+    """Draw where both surveys lie: their bounding boxes, as delivered and registered."""
+    boxes: list[tuple[str, Any, dict[str, Any]]] = []
+    looks: dict[str, dict[str, Any]] = {
+        "reference": {"color": style.REFERENCE},
+        "moving": {"color": style.MOVING},
+    }
+    for name, entry in (("reference", registration.reference), ("moving", registration.moving)):
+        bounds = np.array(entry.get("bounds") or np.nan, float)
+        if bounds.shape != (2, 3) or not np.isfinite(bounds).all():
+            return None
+        boxes.append((name, bounds, looks[name]))
+    if registration.transform is not None:
+        corners = np.stack(np.meshgrid(*boxes[1][1].T, indexing="ij"), axis=-1).reshape(-1, 3)
+        moved = registration.transform.apply(corners)
+        ends = np.stack([moved.min(axis=0), moved.max(axis=0)])
+        boxes.append(("moving, registered", ends, {**looks["moving"], "linestyle": "--"}))
+    low = np.min([ends[0, :2] for _, ends, _ in boxes], axis=0)
+    high = np.max([ends[1, :2] for _, ends, _ in boxes], axis=0)
+    cell = max(float((high - low).max()), 1e-6) / 100
+    rows, cols = np.maximum(np.ceil((high - low)[::-1] / cell).astype(int), 1)
+    place = style.Place(Grid(low[0], high[1], cell, (int(rows), int(cols))))
+    title = "Where the surveys lie"
+    figure = style.new_figure(6.8, 6.4, title, "bounding boxes, seen from above")
+    axes = figure.add_subplot()
+    for name, ends, look in boxes:
+        (west, south), (east, north) = ends[:, :2] - [place.east, place.north]
+        ring = np.array([[west, south], [east, south], [east, north], [west, north], [west, south]])
+        axes.plot(*ring.T, label=name, linewidth=1.8, **look)
+    place.label(axes)
+    axes.margins(0.08)
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.grid(alpha=0.25)
+    style.legend_below(axes)
     return figure
 
 
