@@ -47,7 +47,7 @@ def _put(record: Any, name: str, value: Any) -> None:
     object.__setattr__(record, name, value)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Frame:
     """How one file's coordinates become absolute ones: ``absolute = axes @ file + shift``.
 
@@ -55,7 +55,8 @@ class Frame:
     ----------
     axes : (3, 3) float64
         Signed permutation of the axes times the unit's length in metres (`enu` in metres is the
-        identity; north, east, down is ``[[0, 1, 0], [1, 0, 0], [0, 0, -1]]``).
+        identity; north, east, down is ``[[0, 1, 0], [1, 0, 0], [0, 0, -1]]``). For a COLMAP model
+        any rotation times its scale; for maps the height's unit alone.
     shift : (3,) float64
         East, north, up [m, in `file_crs`], added after the axes.
     file_crs : str or None

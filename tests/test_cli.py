@@ -532,6 +532,27 @@ def test_apply_writes_in_the_reference_files_axes(
     np.testing.assert_allclose(moved, [north, east, -up], atol=1e-5)
 
 
+def test_apply_adds_the_shift_that_the_registered_survey_had(
+    tmp_path: Path, pair: tuple[str, str], run: Run, verdict: Any
+) -> None:
+    verdict("accepted")
+    out, shift = tmp_path / "out", "731000,5705000,0"
+    code, _, error = run(
+        "register", *pair, "-o", out, "--reference-shift", shift, "--moving-shift", shift
+    )
+    assert code == 0, error
+    # The same file, in the same local coordinates, but nothing is said of its shift.
+    code, _, error = run("apply", out, pair[1], "-o", tmp_path / "moved")
+    assert code == 0
+    assert "shift (731000, 5705000, 0) was added" in error
+    again = (tmp_path / "moved" / "new_registered.obj").read_bytes()
+    assert again == (out / "new_registered.obj").read_bytes()
+    # A shift that is said is taken, and what then lies elsewhere is warned of.
+    code, _, error = run("apply", out, pair[1], "-o", tmp_path / "far", "--shift", "9,9,9")
+    assert code == 0
+    assert "outside the survey that was registered" in error
+
+
 def test_apply_refuses_a_rejected_registration(
     tmp_path: Path, pair: tuple[str, str], run: Run, verdict: Any
 ) -> None:

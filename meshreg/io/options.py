@@ -20,7 +20,7 @@ class ReadOptions:
     up : "y" or "z" or None
         Which axis of the file points up; "y" means (x, y, z) is east, up, south.
     unit : str or None
-        Length unit of the file's coordinates: m, cm, mm, ft, us-ft.
+        Length unit of the file's coordinates: m, cm, mm, ft, us-ft, or metres per unit ("0.0123").
     crs : str or None
         CRS of the coordinates after the shift.
     positions : Path or None

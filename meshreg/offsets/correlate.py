@@ -132,7 +132,7 @@ class Correlator:
         return np.asarray(whole[np.ix_(rows, cols)], np.float64)
 
     def many(self, a: Complex, b: Any) -> Any:
-        """``sum_r a[r + s] b_k[r]`` for several b_k at once; `b` holds their conjugates (B, ...)."""
+        """``sum_r a[r + s] b_k[r]`` for several b_k at once; `b` holds conjugates (B, ...)."""
         from scipy.fft import irfft2
 
         size = self.window.padded
