@@ -26,26 +26,26 @@ class Seeing:
     """
 
     altitude: float = 2.0
-    sun: float = 0.9
+    sun: float = 0.25
     sun_azimuth: Drawn = (0.0, 360.0)
-    sun_elevation: Drawn = (45.0, 75.0)
-    ambient: float = 0.4
-    strobe: float = 0.25
-    strobe_arm: float = 0.7
+    sun_elevation: Drawn = (50.0, 80.0)
+    ambient: float = 0.35
+    strobe: float = 0.7
+    strobe_arm: float = 0.6
     strobe_balance: float = 0.6
-    crevice: float = 9.0  # dimming per metre below the surroundings
+    crevice: float = 8.0  # dimming per metre below the surroundings
     attenuation: tuple[float, float, float] = (0.40, 0.09, 0.06)
     haze: tuple[float, float, float] = (0.01, 0.05, 0.07)
     corrected: float = 0.9
     cast: tuple[float, float, float] = (1.0, 1.0, 1.0)
     exposure: float = 0.20  # mean linear brightness of the mosaic
     gamma: float = 2.2
-    vignette: float = 0.5
-    seams: float = 0.06
+    vignette: float = 0.2
+    seams: float = 0.04
     caustics: float = 0.0
     particles: float = 0.5  # per square metre
-    noise: float = 1.5
-    blur: float = 0.002
+    noise: float = 1.0
+    blur: float = 0.004
     heading: Drawn = (0.0, 180.0)
     track_spacing: float = 1.0
     image_spacing: float = 0.8

@@ -33,8 +33,8 @@ def nearest_camera(x, y, plan):
             d2 = da * da + dc * dc
             if d2 < best:
                 best, dx, dy, na, nc = d2, da, dc, ia + i, ic + j
-    high = plan.altitude * (1.0 + 0.10 * (hash01(na, nc, plan.seed + 5) - 0.5))
-    high *= 1.0 + 0.06 * gradient_noise(0.4 * na, 3.7 * nc, plan.seed + 6)
+    high = plan.altitude * (1.0 + 0.04 * (hash01(na, nc, plan.seed + 5) - 0.5))
+    high *= 1.0 + 0.10 * gradient_noise(0.4 * na, 3.7 * nc, plan.seed + 6)
     return dx, dy, na, nc, high
 
 

@@ -73,7 +73,11 @@ ConfigOption = Annotated[
 ]
 MaskOption = Annotated[
     list[str] | None,
-    typer.Option("--mask", metavar="FILE", help="Raster or polygons: what to use; repeatable."),
+    typer.Option(
+        "--mask",
+        metavar="[reference:|moving:][not:]FILE",
+        help="Raster or polygons of what to use, or not; repeatable.",
+    ),
 ]
 ScaleOption = Annotated[
     list[float] | None,

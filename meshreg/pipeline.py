@@ -92,19 +92,10 @@ def register_pair(
         return _too_far(reference, moving, settings, away, clock.seconds, notes)
     with clock.stage("rasterize"):
         pairs = _rasterize(reference, moving, settings, masks, tell)
-    estimates = []
-    for method in settings.methods:
-        with clock.stage(method):
-            estimates.append(estimate_offset(*pairs[ESTIMATORS[method].raster], method, settings))
-            log.info("%s: %s %s", method, estimates[-1].status, estimates[-1].reason)
-    with clock.stage("judge"):
-        judgement = judging.judge(estimates, pairs, settings, radius)
-    refined = None
-    if judgement.best is not None and judgement.verdict != "rejected":
-        with clock.stage("refine"):
-            refined = _refine(judgement, pairs, settings)
-            notes += [refined.note] if refined.note else []
-            judgement = judgement.doubted(refined.doubt)
+    decision = decide(pairs, settings, radius, tell)
+    clock.seconds.update(decision.seconds)
+    judgement, refined = decision.judgement, decision.refined
+    notes += [refined.note] if refined is not None and refined.note else []
     with clock.stage("apply"):
         transform, up_sigma, rasters = _lay_down(reference, moving, refined, settings, masks, pairs)
     return Registration(
@@ -112,7 +103,7 @@ def register_pair(
         reason=judgement.reason,
         transform=transform,
         covariance=None if refined is None else _covariance(refined, up_sigma, transform),
-        estimates=tuple(estimates),
+        estimates=decision.estimates,
         hypotheses=tuple(_plain(h) for h in judgement.hypotheses[:5]),
         before=statistics.compare(
             rasters["reference_dem"],
@@ -145,6 +136,57 @@ def register_pair(
             },
         },
     )
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Decision:
+    """What a pair of rasters says, before the transform is completed by its height.
+
+    Attributes
+    ----------
+    estimates : tuple of OffsetEstimate
+    judgement : Judgement
+        With the doubts of the refinement in its verdict.
+    refined : Refined or None
+        None when rejected.
+    seconds : mapping
+        By stage: each method, "judge", "refine".
+    """
+
+    estimates: tuple[OffsetEstimate, ...]
+    judgement: judging.Judgement
+    refined: Refined | None
+    seconds: Mapping[str, float]
+
+
+def decide(
+    pairs: Pairs, settings: Settings, radius: float, progress: Progress | None = None
+) -> Decision:
+    """Estimate, judge and refine: everything of `register_pair` that looks at rasters alone.
+
+    Parameters
+    ----------
+    pairs : mapping
+        "dem", "ortho" and what else the methods look at ("sift") to (reference, moving).
+    settings : Settings
+    radius : float
+        Half width of the search window [m].
+    progress : callable, optional
+    """
+    clock = _Clock(progress or (lambda stage, fraction: None))
+    estimates = []
+    for method in settings.methods:
+        with clock.stage(method):
+            estimates.append(estimate_offset(*pairs[ESTIMATORS[method].raster], method, settings))
+            log.info("%s: %s %s", method, estimates[-1].status, estimates[-1].reason)
+    with clock.stage("judge"):
+        judgement = judging.judge(estimates, pairs, settings, radius)
+    refined = None
+    if judgement.best is not None and judgement.verdict != "rejected":
+        with clock.stage("refine"):
+            refined = _refine(judgement, pairs, settings)
+            judgement = judgement.doubted(refined.doubt)
+    return Decision(tuple(estimates), judgement, refined, clock.seconds)
 
 
 def versions() -> dict[str, str]:

@@ -132,3 +132,61 @@ def highest(points: Float64, squares: Int32, shape: tuple[int, int], workers: in
             if first <= squares[i] < last:
                 top[squares[i]] = max(top[squares[i]], points[i, 2])
     return top.reshape(shape)
+
+
+@jit(nogil=True)
+def sheets(top: Float64, most: float) -> tuple[Int32, int]:
+    """Label the squares whose tops can be reached from each other by steps of at most `most`.
+
+    Neighbours are the eight around; squares without a point get -1.
+    """
+    rows, cols = top.shape
+    parent = np.arange(rows * cols).astype(np.int32)
+    for row in range(rows):
+        for col in range(cols):
+            if top[row, col] == -np.inf:
+                continue
+            for i, j in ((row, col - 1), (row - 1, col - 1), (row - 1, col), (row - 1, col + 1)):
+                if i < 0 or j < 0 or j >= cols or not abs(top[i, j] - top[row, col]) <= most:
+                    continue
+                a, b = _root(parent, i * cols + j), _root(parent, row * cols + col)
+                parent[max(a, b)] = min(a, b)
+    label = np.full((rows, cols), -1, np.int32)
+    count = 0
+    for row in range(rows):
+        for col in range(cols):
+            if top[row, col] > -np.inf:
+                root = _root(parent, row * cols + col)  # the first square of its sheet
+                if root == row * cols + col:
+                    label[row, col] = count
+                    count += 1
+                else:
+                    label[row, col] = label[root // cols, root % cols]
+    return label, count
+
+
+@jit(nogil=True)
+def sheet_steps(top: Float64, label: Int32, count: int) -> tuple[Float64, Float64, Float64]:
+    """Squares of each sheet, diagonal of its box in squares, least step down to those around it.
+
+    The step is negative where a neighbour is higher, infinite where there is none.
+    """
+    rows, cols = top.shape
+    size = np.zeros(count)
+    step = np.full(count, np.inf)
+    box = np.empty((count, 4))
+    box[:, :2] = np.inf
+    box[:, 2:] = -np.inf
+    for row in range(rows):
+        for col in range(cols):
+            mine = label[row, col]
+            if mine < 0:
+                continue
+            size[mine] += 1.0
+            box[mine, 0], box[mine, 1] = min(box[mine, 0], row), min(box[mine, 1], col)
+            box[mine, 2], box[mine, 3] = max(box[mine, 2], row), max(box[mine, 3], col)
+            for i in range(max(row - 1, 0), min(row + 2, rows)):
+                for j in range(max(col - 1, 0), min(col + 2, cols)):
+                    if label[i, j] >= 0 and label[i, j] != mine:
+                        step[mine] = min(step[mine], top[row, col] - top[i, j])
+    return size, np.hypot(box[:, 2] - box[:, 0] + 1.0, box[:, 3] - box[:, 1] + 1.0), step

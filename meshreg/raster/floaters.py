@@ -95,10 +95,12 @@ def standing_clear(
 def floating_points(points: Float64, spacing: float) -> Bool:
     """Return for each point (N,) whether to keep it, or an empty array to keep all.
 
-    Squares whose top stands over the middle of the tops around them are suspects. The points in
-    them and beside them are joined to pieces by cubes three spacings wide; a piece that lies in
-    suspect squares only is judged as a mesh's. Where more than 1 % of the points would go they
-    are no floaters (a canopy, a building) and all stay.
+    Seen from above first: the highest points of squares four spacings wide are joined to sheets
+    where they differ by less than eight spacings; a small sheet that stands above all squares
+    around it by a gap is a suspect. It may be the top of a steep coral head: so the points in
+    suspect squares and beside them are joined to pieces by cubes three spacings wide, and a piece
+    that does not reach the squares beside is judged as a mesh's. Where more than 1 % of the points
+    would go they are no floaters (trees, a building) and all stay.
 
     Parameters
     ----------
@@ -109,18 +111,22 @@ def floating_points(points: Float64, spacing: float) -> Bool:
     """
     from scipy import ndimage
 
+    from meshreg.raster import floater_kernels as kernels
+
     everything = np.empty(0, bool)
     square = 4.0 * spacing
     tops = _tops(points, square)
-    filled, places = np.isfinite(tops.top), tops.places
-    if not filled.any():
+    sheet, count = kernels.sheets(tops.top, 2.0 * square)
+    size, extent, step = kernels.sheet_steps(tops.top, sheet, count)
+    clear = np.isfinite(step) & (
+        step > np.maximum(2.0 * square, _GAP_EXTENTS * tops.square * extent)
+    )
+    clear &= size <= _SMALL * size.sum()
+    if not clear.any():
         return everything
-    top = np.where(filled, tops.top, tops.top[filled].min())
-    suspect = filled & (top - ndimage.median_filter(top, 9) > _GAP_SPACINGS * spacing)
-    if not suspect.any():
-        return everything
+    suspect = (sheet >= 0) & clear[sheet]
     beside = ndimage.maximum_filter(suspect, 5) & ~suspect
-    inside = places >= 0
+    places, inside = tops.places, tops.places >= 0
     chosen = np.flatnonzero(inside & (suspect | beside).ravel()[places])
     label, count = _pieces(points[chosen], _GAP_SPACINGS * spacing)
     grounded = np.zeros(count, bool)

@@ -140,14 +140,16 @@ def _crossing(ax: float, ay: float, bx: float, slope: float, y: float) -> float:
 
 @jit(nogil=True)
 def _draw_face(
-    points: Float64, faces: Int32, face: int, row0: int, depth: Float32, owner: Int32
+    points: Float64, corners: Int32, mark: int, row0: int, depth: Float32, owner: Int32
 ) -> None:
     """Draw one face into a band that starts at sample row `row0`; the higher surface wins.
+
+    `owner` gets `mark` where it does.
 
     Watertight: the corners are sorted by (y, x), so two faces that share an edge compute where it
     crosses a row from the same numbers in the same order, and both include that point.
     """
-    a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]
+    a, b, c = corners[0], corners[1], corners[2]
     if (points[b, 1], points[b, 0]) < (points[a, 1], points[a, 0]):
         a, b = b, a
     if (points[c, 1], points[c, 0]) < (points[a, 1], points[a, 0]):
@@ -184,7 +186,7 @@ def _draw_face(
             z = np.float32(min(max(base + col * dzdx, lowest), highest))
             if z > depth[row, col]:
                 depth[row, col] = z
-                owner[row, col] = face
+                owner[row, col] = mark
 
 
 @jit(nogil=True)
@@ -223,12 +225,13 @@ def render(
         depth = np.full(((bottom - top) * times, n_cols * times), -np.inf, np.float32)
         owner = np.full(((bottom - top) * times, n_cols * times), -1, np.int32)
         band = top // lattice.band_rows
-        for m in range(faces_of.starts[band], faces_of.starts[band + 1]):
-            _draw_face(mesh.points, mesh.faces, faces_of.members[m], top * times, depth, owner)
+        members = faces_of.members[faces_of.starts[band] : faces_of.starts[band + 1]]
+        for m in range(members.shape[0]):
+            _draw_face(mesh.points, mesh.faces[members[m]], m, top * times, depth, owner)
         if height.size > 0:
             _average_heights(depth, owner, times, height[top:bottom], samples[top:bottom])
         place = BandPlace(top * times, times, top - lattice.first)
         if pages.pixels.size > 0:
-            shade_textures(mesh, pages, owner, place, sums)
+            shade_textures(mesh, members, pages, owner, place, sums)
         if mesh.colors.size > 0:
-            shade_vertices(mesh, owner, place, sums)
+            shade_vertices(mesh, members, owner, place, sums)

@@ -133,13 +133,19 @@ def _bilinear(
 
 @jit(nogil=True)
 def shade_textures(
-    mesh: MeshArrays, pages: Pages, owner: Int32, place: BandPlace, sums: ColorSums
+    mesh: MeshArrays, members: Int32, pages: Pages, owner: Int32, place: BandPlace, sums: ColorSums
 ) -> None:
-    """Add the colors of a band's visible samples that lie on the pages in memory."""
+    """Add the colors of a band's visible samples that lie on the pages in memory.
+
+    `owner` counts within `members`, the band's faces.
+    """
     times, totals, tallies = place.times, sums.totals, sums.tallies
-    plane = np.empty(10, np.float64)
+    planes = np.empty((members.shape[0], 10), np.float64)  # of a face when it is first seen
+    page_of = np.full(members.shape[0], -2, np.int32)  # -2: not seen yet, -1: not in memory
+    page = -1
     offset = width = height = 0
-    wrap = here = False
+    wrap = False
+    u0 = u_col = u_row = v0 = v_col = v_row = u_low = u_high = v_low = v_high = 0.0
     for i in range(owner.shape[0]):
         last = -1
         y = float(i + place.row0)
@@ -148,21 +154,30 @@ def shade_textures(
             red = green = blue = 0
             count, low, high = 0, 765, 0
             for j in range(col * times, (col + 1) * times):
-                face = owner[i, j]
-                if face < 0:
+                mine = owner[i, j]
+                if mine < 0:
                     continue
-                if face != last:
-                    last = face
-                    page = mesh.face_page[face]
-                    here = page >= 0 and pages.table[page, 0] >= 0.0
-                    if here:
+                if mine != last:
+                    last = mine
+                    page = page_of[mine]
+                    if page == -2:
+                        page = mesh.face_page[members[mine]]
+                        if page >= 0 and pages.table[page, 0] < 0.0:
+                            page = -1
+                        page_of[mine] = page
+                        if page >= 0:
+                            _texel_plane(mesh, members[mine], pages.table[page], planes[mine])
+                    if page >= 0:
                         offset, wrap = int(pages.table[page, 0]), pages.table[page, 3] > 0.0
                         width, height = int(pages.table[page, 1]), int(pages.table[page, 2])
-                        _texel_plane(mesh, face, pages.table[page], plane)
-                if not here:
+                        u0, u_col, u_row = planes[mine, 0], planes[mine, 1], planes[mine, 2]
+                        v0, v_col, v_row = planes[mine, 3], planes[mine, 4], planes[mine, 5]
+                        u_low, u_high = planes[mine, 6], planes[mine, 7]
+                        v_low, v_high = planes[mine, 8], planes[mine, 9]
+                if page < 0:
                     continue
-                u = min(max(plane[0] + plane[1] * j + plane[2] * y, plane[6]), plane[7])
-                v = min(max(plane[3] + plane[4] * j + plane[5] * y, plane[8]), plane[9])
+                u = min(max(u0 + u_col * j + u_row * y, u_low), u_high)
+                v = min(max(v0 + v_col * j + v_row * y, v_low), v_high)
                 r, g, b = _bilinear(pages.pixels, pages.seen, offset, (width, height), wrap, u, v)
                 if r >= 0:
                     red, green, blue = red + r, green + g, blue + b
@@ -178,13 +193,17 @@ def shade_textures(
 
 
 @jit(nogil=True)
-def shade_vertices(mesh: MeshArrays, owner: Int32, place: BandPlace, sums: ColorSums) -> None:
+def shade_vertices(
+    mesh: MeshArrays, members: Int32, owner: Int32, place: BandPlace, sums: ColorSums
+) -> None:
     """Add the interpolated vertex colors of a band's visible samples that have no page."""
     points, totals, tallies = mesh.points, sums.totals, sums.tallies
     for i in range(owner.shape[0]):
         for j in range(owner.shape[1]):
-            face = owner[i, j]
-            if face < 0 or (mesh.face_page.size > 0 and mesh.face_page[face] >= 0):
+            if owner[i, j] < 0:
+                continue
+            face = members[owner[i, j]]
+            if mesh.face_page.size > 0 and mesh.face_page[face] >= 0:
                 continue
             a, b, c = mesh.faces[face, 0], mesh.faces[face, 1], mesh.faces[face, 2]
             ax, ay = points[a, 0], points[a, 1]

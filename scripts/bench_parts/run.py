@@ -1,7 +1,8 @@
 """Run the parts of the benchmark and print their tables.
 
 A part is a module here with `bench() -> list of rows`; a row is a dict whose keys are the columns
-of the part's table, in order. The first line of the module's docstring is the table's title.
+of the part's table, in order, or a tuple (what, seconds, note). The first line of the module's
+docstring is the table's title. A part that fails is a line in the table, not the end of the run.
 """
 
 from __future__ import annotations
@@ -31,6 +32,20 @@ def text_of(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:.3g}" if abs(value) < 1000 else f"{value:,.0f}"
     return "" if value is None else str(value)
+
+
+def rows_of(name: str) -> tuple[str, list[Mapping[str, Any]]]:
+    """Run one part; return its title and its rows."""
+    try:
+        module = importlib.import_module(name)
+        title = (module.__doc__ or name).strip().splitlines()[0]
+        rows = module.bench()
+    except Exception as error:
+        return name, [{"failed": f"{type(error).__name__}: {error}".splitlines()[0]}]
+    names = ("what", "seconds", "note")
+    return title, [
+        row if isinstance(row, Mapping) else dict(zip(names, row, strict=True)) for row in rows
+    ]
 
 
 def table(rows: Sequence[Mapping[str, Any]]) -> str:
@@ -66,9 +81,8 @@ def main() -> int:
     on = machine()
     sections = []
     for name in names:
-        module = importlib.import_module(name)
-        title = (module.__doc__ or name).strip().splitlines()[0]
-        section = f"## {name}\n\n{title}\n\n{table(module.bench())}\n"
+        title, rows = rows_of(name)
+        section = f"## {name}\n\n{title}\n\n{table(rows)}\n"
         print(section, flush=True)
         sections.append(section)
     if chosen.write:
