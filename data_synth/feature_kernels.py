@@ -188,7 +188,7 @@ def _living(f, dx, dy, mark, finest):
     fine = octaves(dx, dy, f.seed + 14, 0.05, finest, 0.6, 3)
     polyps = octaves(dx, dy, f.seed + 15, 0.011, finest, 0.7, 2)
     light = 0.55 + 0.7 * mark
-    light *= 1.0 + 0.10 * fine + 0.13 * polyps
+    light *= 1.0 + 0.15 * fine + 0.08 * polyps
     r, g, b = f.red * light, f.green * light, f.blue * light
     if f.kind == BRANCHING or f.kind == PLATE:
         pale = max(0.0, mark - 0.72) / 0.28

@@ -31,6 +31,21 @@ def _mixed(x, y, ground, salt, wavelength, finest, count):
 
 
 @jit(nogil=True, error_model="numpy")
+def _spots(x, y, ground, salt, cell, presence):
+    """Scattered blots -1 (dark) to 1 (light): those of the epoch replace a share `ground.mix`."""
+    n = x.size
+    out, up, own = np.zeros(n), np.empty(n), np.empty(n)
+    for epoch in range(2):
+        share = ground.mix if epoch == 1 else 1.0 - ground.mix
+        if share > 0.0:
+            seed = (ground.mix_seed if epoch == 1 else ground.seed) + salt
+            lumps_into(x, y, cell, 0.9, seed, presence * share, up, own)
+            for i in range(n):
+                out[i] += up[i] * (2.4 * own[i] - 1.0)
+    return out
+
+
+@jit(nogil=True, error_model="numpy")
 def sand_height(x, y, ground, finest):
     """Height of the sand sheet [m] and the ripples' phase: 0 in the trough, 1 on the crest."""
     z = np.full(x.size, ground.sand_level)
@@ -156,33 +171,42 @@ def ground_block(x, y, ground, finest):
 @jit(nogil=True, error_model="numpy")
 def rock_color(x, y, ground, shade, cover, finest, out):
     """Put the reflectance of rock, turf, coralline crust and rubble into `out` (N, 3)."""
+    n = x.size
     zone = _noise(x, y, ground.seed + 50, 1.3, finest, 0.6, 2)
-    patch = _mixed(x, y, ground, 51, 0.35, finest, 3)
+    patch = _mixed(x, y, ground, 51, 0.35, finest, 4)
     fine = _mixed(x, y, ground, 52, 0.055, finest, 3)
     grain = _mixed(x, y, ground, 53, 0.010, finest, 2)
-    for i in range(x.size):
+    # crusts of sponge, bryozoans, barnacles, holes
+    blots = np.zeros(n)
+    if finest < 0.06:
+        blots += 0.8 * _spots(x, y, ground, 54, 0.15, 0.30)
+    if finest < 0.03:
+        blots += _spots(x, y, ground, 55, 0.055, 0.25)
+    for i in range(n):
         f, p, g, h = fine[i], patch[i], grain[i], shade[i]
+        spot = blots[i]
+        tone = max(0.25, 1.0 + 0.16 * p + 0.20 * f + 0.09 * g + 0.55 * spot)
         # bare limestone or basalt
-        low = 0.17 * (0.50 + 0.95 * h) * (1.0 + 0.14 * p + 0.16 * f + 0.14 * g)
+        low = 0.19 * (0.45 + 1.05 * h) * tone
         red, green = low * ground.tone_red, low * ground.tone_green
         blue = low * ground.tone_blue
         # turf: olive to brown, darker, in patches with ragged edges
         t = 0.7 * zone[i] + p + 0.35 * f + 1.6 * ground.turf - 0.6
-        t = ground.turf * smoothstep(-1.3, 0.9, t)
+        t = ground.turf * smoothstep(-1.1, 0.6, t)
         hue = 0.5 + 0.25 * p
-        low = 0.080 * (0.65 + 0.7 * h) * (1.0 + 0.22 * f + 0.20 * g)
+        low = 0.075 * (0.55 + 0.9 * h) * max(0.2, tone + 0.12 * f)
         red += t * (low * (1.05 + 0.25 * hue) - red)
         green += t * (low * (0.96 - 0.10 * hue) - green)
         blue += t * (low * (0.50 - 0.12 * hue) - blue)
         # coralline algae: mauve and pink crusts with sharp borders
         t = 0.5 * zone[i] - 0.55 * p + 0.45 * f + 0.4 * (h - 0.5)
         t = ground.coralline * smoothstep(0.55, 0.8, t)
-        low = 0.20 * (1.0 + 0.15 * f + 0.12 * g)
+        low = 0.20 * (1.0 + 0.18 * f + 0.08 * g)
         red += t * (low * 1.15 - red)
         green += t * (low * 0.72 - green)
         blue += t * (low * 0.82 - blue)
         t = 0.8 * cover[i]
-        low = (0.10 + 0.20 * h * h) * (1.0 + 0.15 * f + 0.18 * g)
+        low = (0.08 + 0.26 * h * h) * (1.0 + 0.18 * f + 0.10 * g)
         red += t * (low * 1.02 - red)
         green += t * (low * 0.96 - green)
         blue += t * (low * 0.80 - blue)

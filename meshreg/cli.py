@@ -331,6 +331,49 @@ def demo(
     return _do_register(request, voice)
 
 
+@app.command()
+def benchmark(
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for pairs, tables, page.")],
+    scenarios: Annotated[
+        str | None, typer.Option(metavar="A,B,...", help="Some of the scenarios; all.")
+    ] = None,
+    repeats: Annotated[
+        int | None, typer.Option(help="Pairs of each ground and interval; 21.")
+    ] = None,
+    elsewhere: Annotated[
+        int | None, typer.Option(metavar="N", help="Pairs of different places; 1000.")
+    ] = None,
+    size: Annotated[float | None, typer.Option(help="Side of the patches in metres; 12.")] = None,
+    workers: Annotated[int, typer.Option(help="Processes.")] = 2,
+    seed: Annotated[int | None, typer.Option(help="Seed of every pair; 0.")] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on where it stopped.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Start afresh.")] = False,
+    as_json: JsonOption = False,
+    debug: DebugOption = False,
+) -> int:
+    """Repeat the paper's experiment on pairs with known truth. Exit code 4: not as expected."""
+    del debug
+    from meshreg.cli_parts import benchmarking
+    from meshreg.cli_parts.guard import StoppedError, run_stoppable
+
+    request = benchmarking.BenchmarkRequest(
+        out, scenarios, repeats, elsewhere, size, seed, workers, resume, overwrite
+    )
+    voice = _voice(as_json)
+    try:
+        summary = run_stoppable(
+            lambda unfinished: benchmarking.benchmark(request, voice, unfinished)
+        )
+    except StoppedError as stopped:
+        voice.err.print("Stopped; what is done is kept: --resume goes on.")
+        return stopped.exit_code
+    if as_json:
+        voice.document(summary)
+    else:
+        benchmarking.show(summary, out, voice)
+    return 4 if summary["unmet"] else 0
+
+
 def _voice(as_json: bool) -> Voice:
     from meshreg.cli_parts.console import Voice
 

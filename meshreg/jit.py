@@ -11,6 +11,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
+import numba
+
 _F = TypeVar("_F", bound=Callable[..., Any])
 
 
@@ -26,10 +28,8 @@ def _cache_folder() -> Path | None:
 
 
 _FOLDER = _cache_folder()
-if _FOLDER is not None:
-    os.environ.setdefault("NUMBA_CACHE_DIR", str(_FOLDER))  # read when numba is imported
-
-import numba  # noqa: E402
+if _FOLDER is not None and not numba.config.CACHE_DIR:  # a user's own NUMBA_CACHE_DIR stays
+    numba.config.CACHE_DIR = str(_FOLDER)
 
 
 def jit(**options: Any) -> Callable[[_F], _F]:

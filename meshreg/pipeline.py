@@ -28,6 +28,7 @@ from meshreg.refine import Refined, refine
 from meshreg.settings import Settings
 from meshreg.types import (
     Float64,
+    Grid,
     OffsetEstimate,
     Registration,
     Survey,
@@ -252,30 +253,47 @@ def _gap_between(reference: Survey, moving: Survey) -> float:
     return float(max(gaps.max(), 0.0))
 
 
-def _rasterize(
-    reference: Survey, moving: Survey, settings: Settings, masks: Mapping[str, Any], tell: Progress
-) -> Pairs:
-    """Both surveys at each cell that is needed; where they fit, the coarser are exact means."""
+def _cells(settings: Settings) -> dict[str, float]:
+    """Cell [m] of each kind of raster that the methods and the judge look at."""
     options = settings.raster
     cells = {"sift": options.sift_cell, "ortho": options.ortho_cell, "dem": options.dem_cell}
     needed = {ESTIMATORS[m].raster for m in settings.methods} | {"ortho", "dem"}
-    sizes = {name: float(cells[name] or 0.0) for name in needed}
-    finest, coarsest = min(sizes.values()), max(sizes.values())
-    made: dict[str, list[SurveyRaster]] = {name: [] for name in needed}
+    return {name: float(cells[name] or 0.0) for name in needed}
+
+
+def _levels(
+    survey: Survey,
+    grids: Mapping[str, Grid],
+    settings: Settings,
+    mask: Any,
+    transform: Transform | None = None,
+) -> dict[str, SurveyRaster]:
+    """Rasterize a survey on the finest of the grids; the others are exact means where they fit."""
+    finest = min(grids.values(), key=lambda grid: grid.cell)
+    fine = rasterize(survey, finest, settings.raster, transform=transform, mask=mask)
+    made = {}
+    for name, grid in grids.items():
+        times = round(grid.cell / finest.cell)
+        if abs(grid.cell - times * finest.cell) < 1e-9 * grid.cell:
+            made[name] = fine if times == 1 else coarsened(fine, times)
+        else:
+            made[name] = rasterize(survey, grid, settings.raster, transform=transform, mask=mask)
+    return made
+
+
+def _rasterize(
+    reference: Survey, moving: Survey, settings: Settings, masks: Mapping[str, Any], tell: Progress
+) -> Pairs:
+    """Both surveys at each cell that is needed, on one lattice."""
+    cells = _cells(settings)
+    coarsest = max(cells.values())
+    made = []
     for done, (which, survey) in enumerate((("reference", reference), ("moving", moving))):
-        mask = masks[which]
-        fine = rasterize(survey, survey_grid(survey, finest, coarsest), options, mask=mask)
-        for name, cell in sizes.items():
-            times = round(cell / finest)
-            if times == 1:
-                raster = fine
-            elif abs(cell - times * finest) < 1e-9 * cell:
-                raster = coarsened(fine, times)
-            else:
-                raster = rasterize(survey, survey_grid(survey, cell), options, mask=mask)
-            made[name].append(raster)
+        fits = all(abs(coarsest / c - round(coarsest / c)) < 1e-9 for c in cells.values())
+        grids = {n: survey_grid(survey, c, coarsest if fits else None) for n, c in cells.items()}
+        made.append(_levels(survey, grids, settings, masks[which]))
         tell("rasterize", 0.5 * (done + 1))
-    return {name: (pair[0], pair[1]) for name, pair in made.items()}
+    return {name: (made[0][name], made[1][name]) for name in cells}
 
 
 def _refine(judgement: judging.Judgement, pairs: Pairs, settings: Settings) -> Refined:
@@ -302,18 +320,15 @@ def _lay_down(
     pairs: Pairs,
 ) -> tuple[Transform | None, float, dict[str, Any]]:
     """Complete the transform by its height, and rasterize both surveys on common grids."""
-    options = settings.raster
     rasters: dict[str, Any] = {}
     horizontal = None if refined is None else _horizontal(refined, moving)
+    grids = {name: common_grid(a.grid, b.grid) for name, (a, b) in pairs.items()}
     for name in ("dem", "ortho"):
-        first, second = pairs[name]
-        grid = common_grid(first.grid, second.grid)
-        rasters[f"reference_{name}"] = statistics.on_grid(first, grid)
-        rasters[f"moving_{name}_before"] = statistics.on_grid(second, grid)
-        if horizontal is not None:
-            rasters[f"moving_{name}"] = rasterize(
-                moving, grid, options, transform=horizontal, mask=masks["moving"]
-            )
+        rasters[f"reference_{name}"] = statistics.on_grid(pairs[name][0], grids[name])
+        rasters[f"moving_{name}_before"] = statistics.on_grid(pairs[name][1], grids[name])
+    if horizontal is not None:
+        moved = _levels(moving, grids, settings, masks["moving"], horizontal)
+        rasters |= {"moving_dem": moved["dem"], "moving_ortho": moved["ortho"]}
     if horizontal is None:
         return None, float("nan"), rasters
     up, up_sigma = statistics.height_offset(rasters["reference_dem"], rasters["moving_dem"])
@@ -329,7 +344,9 @@ def _horizontal(refined: Refined, moving: Survey) -> Transform:
     c, s = np.cos(refined.yaw), np.sin(refined.yaw)
     rotation = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     pivot = np.append(refined.pivot, moving.centre[2])
-    return Transform(rotation, 1.0, np.append(refined.offset, 0.0), pivot).at(moving.centre)
+    # a tenth of a nanometre is the end of what float64 heights at UTM size can say
+    offset = np.round(np.append(refined.offset, 0.0), 10)
+    return Transform(rotation, 1.0, offset, pivot).at(moving.centre)
 
 
 def _covariance(refined: Refined, up_sigma: float, transform: Transform | None) -> Float64:

@@ -1,8 +1,8 @@
-"""From the search's cell to the ground's own detail: tile offsets, yaw and their covariance.
+"""The rigid answer from tile offsets: offset, yaw and their covariance.
 
-Both surveys are cut into tiles; each tile is matched on its own, close to the offset already
-found, in each channel. A rotation about the vertical shows as tile offsets that turn; what is
-left is the internal distortion of the two models, which also says how sure the answer is.
+Both surveys are cut into tiles that are matched alone (`tiles`). A rotation about the vertical
+shows as tile offsets that turn; what is left is the internal distortion of the two models, which
+also says how sure the answer is.
 """
 
 from __future__ import annotations
@@ -13,34 +13,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from meshreg.offsets import neutral
-from meshreg.offsets.correlate import Correlator, Window
-from meshreg.offsets.surface import MAD_TO_SIGMA, find_peak
+from meshreg.offsets.surface import MAD_TO_SIGMA
+from meshreg.tiles import MAX_YAW, TileOffsets, correlated_tiles, polished_tiles
 from meshreg.types import Float64, SurveyRaster
 
-MAX_YAW = np.deg2rad(1.0)
 MIN_TILES = 6
-
-
-@dataclass(frozen=True, eq=False)
-class TileOffsets:
-    """How far each tile must go, measured alone.
-
-    Attributes
-    ----------
-    places : (M, 2) float64
-        Centres of the moving tiles, absolute east and north [m].
-    offsets : (M, 2) float64
-        East and north [m] to add to moving coordinates.
-    block : (M,) int
-        Tiles at the same place share a block, whichever channel saw them.
-    channel : (M,) int
-        Which of the channels matched it.
-    """
-
-    places: Float64
-    offsets: Float64
-    block: np.ndarray
-    channel: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,6 +66,7 @@ def refine(
     Parameters
     ----------
     rasters : sequence of (reference, moving, channel)
+        The channels that support the offset.
     offset : (east, north)
         The judged offset [m].
     sigma : (2, 2) float64
@@ -96,111 +74,52 @@ def refine(
     agree : float
         The refined offset may differ from the judged one by this much [m].
     """
-    measured = [
-        tile_offsets(reference, moving, channel, offset) for reference, moving, channel in rasters
-    ]
-    tiles = _joined([m for m in measured if m is not None])
     centre = _overlap_centre(rasters[0][0], rasters[0][1], offset)
     coarse = Refined(centre, np.array(offset), 0.0, _block_diagonal(sigma, MAX_YAW**2 / 9))
-    if tiles is None or len(np.unique(tiles.block)) < MIN_TILES:
+    tiles = _joined([correlated_tiles(a, b, channel, offset) for a, b, channel in rasters])
+    best = _rigid(tiles, centre)
+    if best is None:
         return replace(coarse, note="too few tiles match on their own to measure yaw")
-    turning = fit(tiles, centre, yaw_free=True)
-    yaw_sigma = float(np.sqrt(turning.covariance[2, 2]))
-    significant = abs(turning.yaw) > 2 * yaw_sigma
-    if significant and abs(turning.yaw) > MAX_YAW:
-        turn = np.rad2deg(turning.yaw)
-        doubt = f"the surveys are turned by about {turn:.1f}°, beyond the ±1° searched"
-        return replace(coarse, doubt=doubt)
-    best = turning if significant else fit(tiles, centre, yaw_free=False)
-    if float(np.hypot(*(best.offset - offset))) > agree:
-        moved = float(np.hypot(*(best.offset - offset)))
-        return replace(
-            coarse, doubt=f"tiles matched alone lie {moved:.2f} m from the whole's offset"
-        )
+    for reference, moving, channel in rasters:
+        if channel == "terrain":
+            finer = _polished(reference, moving, best)
+            best = finer if finer is not None and _size(finer) < _size(best) else best
+    if abs(best.yaw) > MAX_YAW:
+        turn = np.rad2deg(best.yaw)
+        return replace(coarse, doubt=f"the surveys are turned by about {turn:.1f}°, beyond ±1°")
+    moved = float(np.hypot(*(best.offset - offset)))
+    if moved > agree:
+        return replace(coarse, doubt=f"tiles alone lie {moved:.2f} m from the whole's offset")
     return best
 
 
-def tile_offsets(
-    reference: SurveyRaster,
-    moving: SurveyRaster,
-    channel: neutral.Channel,
-    offset: tuple[float, float],
-) -> TileOffsets | None:
-    """Match each tile of the moving raster alone, within the reach of a yaw of ±1°."""
-    first, second = neutral.fields(reference, channel), neutral.fields(moving, channel)
-    cell = moving.grid.cell
-    nominal = Window.around(reference.grid, moving.grid, cell)
-    row0 = int(nominal.rows[1] - round(offset[1] / cell))
-    col0 = int(nominal.cols[1] + round(offset[0] / cell))
-    rows, cols = moving.grid.shape
-    r_low, r_high = max(0, -row0), min(rows, reference.grid.shape[0] - row0)
-    c_low, c_high = max(0, -col0), min(cols, reference.grid.shape[1] - col0)
-    if min(r_high - r_low, c_high - c_low) < 32:
-        return None
-    side = int(np.clip(min(r_high - r_low, c_high - c_low) // 5, 16, 128))
-    half_diagonal = 0.5 * np.hypot(r_high - r_low, c_high - c_low)
-    reach = int(np.ceil(half_diagonal * MAX_YAW)) + 3
-    places, offsets, blocks = [], [], []
-    for index_r, top in enumerate(range(r_low, r_high - side + 1, side)):
-        for index_c, left in enumerate(range(c_low, c_high - side + 1, side)):
-            found = _match_tile(first, second, (top, left, side), (row0, col0), reach, cell)
-            if found is None:
-                continue
-            d_east, d_north = found
-            middle = (top + 0.5 * side - 0.5, left + 0.5 * side - 0.5)
-            places.append(moving.grid.east_north(*middle))
-            exact = (
-                (col0 - int(nominal.cols[1])) * cell + d_east,
-                (int(nominal.rows[1]) - row0) * cell + d_north,
-            )
-            offsets.append(exact)
-            blocks.append(1000 * index_r + index_c)
-    if not places:
-        return None
-    return TileOffsets(
-        np.array(places, float),
-        np.array(offsets, float),
-        np.array(blocks),
-        np.zeros(len(blocks), int) + (channel == "image"),
-    )
+def _polished(reference: SurveyRaster, moving: SurveyRaster, start: Refined) -> Refined | None:
+    """Polish the tiles from the rigid answer, and again from what they say, until it stays."""
+    answer: Refined | None = start
+    for _ in range(4):
+        before = answer
+        assert before is not None
+        tiles = polished_tiles(reference, moving, before.offset, before.yaw, before.pivot)
+        answer = _rigid(tiles, before.pivot)
+        if answer is None:
+            return None
+        if np.hypot(*(answer.offset - before.offset)) < 0.005 * moving.grid.cell:
+            break
+    return answer
 
 
-def _match_tile(
-    first: neutral.Fields,
-    second: neutral.Fields,
-    tile: tuple[int, int, int],
-    shift: tuple[int, int],
-    reach: int,
-    cell: float,
-) -> tuple[float, float] | None:
-    """Offset (east, north) [m] of one tile from the common shift; None where it has no peak."""
-    top, left, side = tile
-    up, west = max(0, top + shift[0] - reach), max(0, left + shift[1] - reach)
-    big = (
-        slice(up, top + shift[0] + side + reach),
-        slice(west, left + shift[1] + side + reach),
-    )
-    small = (slice(top, top + side), slice(left, left + side))
-    a, b = first.mapped(lambda f: f[big]), second.mapped(lambda f: f[small])
-    if b.mask.mean() < 0.5 or a.mask.mean() < 0.5:
+def _rigid(tiles: TileOffsets | None, pivot: Float64) -> Refined | None:
+    """Rigid fit of enough tiles; the yaw is 0 where it is under two of its sigmas."""
+    if tiles is None or len(np.unique(tiles.block)) < MIN_TILES:
         return None
-    steps = np.arange(-reach, reach + 1)
-    window = Window(
-        cell,
-        steps + (top + shift[0] - up),
-        steps + (left + shift[1] - west),
-        np.asarray(steps * cell, np.float64),
-        np.asarray(-steps * cell, np.float64),
-        (a.mask.shape, b.mask.shape),
-    )
-    correlator = Correlator(window)
-    surface, _ = neutral.surface(
-        neutral.spectra(a, correlator), neutral.spectra(b, correlator), correlator, 0.5
-    )
-    peak = find_peak(surface, window.east, window.north, exclusion=3 * cell)
-    if peak is None or peak.border or peak.gap < 0.5:
-        return None
-    return peak.east, peak.north
+    turning = fit(tiles, pivot, yaw_free=True)
+    if abs(turning.yaw) > 2 * np.sqrt(turning.covariance[2, 2]):
+        return turning
+    return fit(tiles, pivot, yaw_free=False)
+
+
+def _size(refined: Refined) -> float:
+    return float(np.trace(refined.covariance[:2, :2]))
 
 
 def fit(tiles: TileOffsets, pivot: Float64, *, yaw_free: bool, iterations: int = 20) -> Refined:
@@ -267,8 +186,9 @@ def _sandwich(design: Float64, weights: Float64, residual: Float64, block: np.nd
     return np.asarray(bread @ (sums.T @ sums) @ bread * freedom)
 
 
-def _joined(parts: Sequence[TileOffsets]) -> TileOffsets | None:
+def _joined(found: Sequence[TileOffsets | None]) -> TileOffsets | None:
     """Tiles of both channels; blocks are by place, on a common lattice of the coarser tiles."""
+    parts = [tiles for tiles in found if tiles is not None]
     if not parts:
         return None
     places = np.concatenate([p.places for p in parts])

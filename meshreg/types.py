@@ -329,7 +329,9 @@ class Survey:
             return np.array([[west, south, low], [east, north, high]])
         points = self.geometry.points
         if isinstance(self.geometry, Mesh) and len(self.geometry.faces):
-            points = points[np.unique(self.geometry.faces)]
+            used = np.zeros(len(points), bool)
+            used[self.geometry.faces.ravel()] = True
+            points = points if used.all() else points[used]
         return np.asarray(np.stack([points.min(axis=0), points.max(axis=0)]) + self.origin)
 
     @property

@@ -83,7 +83,7 @@ def test_a_survey_onto_itself_stays():
     registration = register_pair(reference, reference, QUICK)
     assert registration.verdict == "accepted"
     matrix = registration.transform.matrix
-    assert np.abs(matrix - np.eye(4)).max() < 2e-4
+    assert np.abs(matrix - np.eye(4)).max() < 1e-6
 
 
 def test_large_coordinates_change_nothing():

@@ -89,7 +89,7 @@ def test_other_half_of_the_beach_is_rejected():
         used = keep[faces].all(axis=1)
         geometry = dataclasses.replace(
             whole.geometry,
-            vertices=whole.geometry.vertices + (0, shift, 0),
+            vertices=whole.geometry.vertices + np.array([0, shift, 0]),
             faces=faces[used],
             uv=whole.geometry.uv[used],
             face_texture=whole.geometry.face_texture[used],

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import seafloor
 
-from meshreg.refine import TileOffsets, fit, refine
+from meshreg.refine import fit, refine
+from meshreg.tiles import TileOffsets
 
 OFFSET = (1.237, -2.412)
 

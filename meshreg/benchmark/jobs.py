@@ -95,7 +95,7 @@ def _site(job: Job, folder: Path) -> Record:
 
 
 def _elsewhere(job: Job, folder: Path) -> Record:
-    """Reference survey of one place, moving survey of another, at the same coordinates."""
+    """Lay the moving survey of one place over the reference survey of another."""
     i, j = job.sites
     pairs = rasters.rehomed(
         rasters.load_place(place_path(i, folder), "reference"),

@@ -23,7 +23,7 @@ Row = dict[str, Any]
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """A horizontal answer: offset [m] at a pivot, turn about it, covariance of (east, north, yaw)."""
+    """Offset [m] at a pivot, turn about it, covariance of (east, north, yaw)."""
 
     pivot: Float64
     offset: Float64
@@ -173,14 +173,14 @@ def _finished(
     if place is None and answer is not None:
         place = answer.pivot
     done = []
-    for row in [*rows, fused]:
+    for measured in [*rows, fused]:
+        row = {**measured, "preset": preset}
         one: Answer | None = row.pop("_answer")
-        row["preset"] = preset
         if one is not None and place is not None:
             offset, sigma = one.at(place)
-            row |= {"east": float(offset[0]), "north": float(offset[1]), "yaw": one.yaw}
+            row.update(east=float(offset[0]), north=float(offset[1]), yaw=one.yaw)
             if known:
-                row |= _errors(offset, sigma, np.array(truth["offset"][:2]))
+                row.update(_errors(offset, sigma, np.array(truth["offset"][:2])))
             if hand is not None:
                 away = offset - [hand.east, hand.north]
                 row["error_hand"] = float(np.hypot(*away))

@@ -197,7 +197,7 @@ def _seed(*parts: Any) -> int:
 
 
 def _table_jobs(options: Options, chosen: tuple[str, ...]) -> Iterator[Job]:
-    """The paper's sites with the paper's own offsets and residuals."""
+    """Take the paper's sites with the paper's own offsets and residuals."""
     for name in PAPER_SITES:
         if name in chosen:
             seed = _seed(options.seed, "table", name, 0)
@@ -250,7 +250,8 @@ def different_places(count: int, sites: int, seed: int) -> list[tuple[int, int]]
     """
     rng = np.random.default_rng([seed, 60])
     kind = [tuple(CROSSING.values())[k % len(CROSSING)][0] for k in range(sites)]
-    alike, unlike = [], []
+    alike: list[tuple[int, int]] = []
+    unlike: list[tuple[int, int]] = []
     for i in range(sites):
         for j in range(sites):
             if i != j:

@@ -99,7 +99,7 @@ def _raster(stored: Any, prefix: str) -> SurveyRaster:
 
 
 def rehomed(reference: Rasters, moving: Rasters) -> Pairs:
-    """Give the moving survey the reference's coordinates and depth, so that only the ground differs.
+    """Give the moving survey the reference's coordinates and depth: only the ground differs.
 
     It is moved by whole DEM cells, which are whole cells of the finer rasters too.
     """

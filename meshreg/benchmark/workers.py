@@ -80,8 +80,7 @@ class _Crew:
                     result = pipe.recv()
                 except (EOFError, OSError):
                     left.append((index, items[index]))
-                    pipe = self._replaced(pipe)
-                    self._give(pipe, left, busy)
+                    self._give(self._replaced(pipe), left, busy)
                     continue
                 self._give(pipe, left, busy)
                 yield index, result
@@ -113,7 +112,9 @@ class _Crew:
             process.join(5.0)
 
 
-def _serve(pipe: Connection, task: Callable[..., Any], shared: tuple[Any, ...], threads: int) -> None:
+def _serve(
+    pipe: Connection, task: Callable[..., Any], shared: tuple[Any, ...], threads: int
+) -> None:
     """Work until the other end of the pipe is closed, which the parent's death does too."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's business
     import cv2

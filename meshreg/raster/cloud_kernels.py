@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +11,27 @@ from numpy.typing import NDArray
 from meshreg.jit import jit, prange
 from meshreg.types import Bool, Float32, Float64, Int32, UInt8
 
+Int64 = NDArray[np.int64]
 _CHUNK = 65536
+_PARTS = 64  # into which the points are cut for sorting
+
+
+class SortedPoints(NamedTuple):
+    """Points in the order of blocks of cells: those of block b are ``starts[b]:starts[b + 1]``."""
+
+    starts: Int64
+    cells: Int32  # (n,)
+    up: Float32  # (n,) height
+    rgb: UInt8  # (n, 3), or (0, 3) without colors
+
+
+class CellArrays(NamedTuple):
+    """A raster's arrays, flat over the cells, to be written."""
+
+    height: Float32
+    samples: NDArray[np.uint16]
+    color: UInt8  # (cells, 3)
+    color_valid: Bool
 
 
 @jit(parallel=True, nogil=True)
@@ -40,49 +61,72 @@ def cells_of(points: Float64, keep: Bool, cell: float, shape: tuple[int, int]) -
 
 
 @jit(parallel=True, nogil=True)
-def top_sums(
-    cells: Int32, points: Float64, colors: UInt8, layer: float, first: int, bounds: Int32
-) -> Float32:
-    """Sum up, for the cells `first` and on, the points within `layer` below each cell's highest.
+def sorted_points(
+    cells: Int32, points: Float64, colors: UInt8, n_cells: int, block: int
+) -> SortedPoints:
+    """Sort the points to blocks of `block` cells, keeping their order (a parallel counting sort).
 
-    A row of the result is (highest, count, sum of heights less the highest, red, green, blue).
-    Worker w looks at all points and keeps the cells `bounds[w]` to `bounds[w + 1]` (counted from
-    `first`): each cell's sum is taken by one worker in the points' order, however many there are.
+    What lies in one block then fits in a core's cache. `colors` may be empty.
     """
-    sums = np.zeros((bounds[-1], 8), np.float32)  # a row to half a cache line
-    sums[:, 0] = -np.inf
-    colored = colors.shape[0] > 0
-    for worker in prange(len(bounds) - 1):
-        low, high = bounds[worker], bounds[worker + 1]
-        for i in range(points.shape[0]):
-            cell = cells[i] - first
-            if low <= cell < high:
-                sums[cell, 0] = max(sums[cell, 0], np.float32(points[i, 2]))
-        for i in range(points.shape[0]):
-            cell = cells[i] - first
-            if low <= cell < high:
-                below = np.float32(points[i, 2]) - sums[cell, 0]
-                if below >= -layer:
-                    sums[cell, 1] += 1.0
-                    sums[cell, 2] += below
-                    if colored:
-                        sums[cell, 3] += colors[i, 0]
-                        sums[cell, 4] += colors[i, 1]
-                        sums[cell, 5] += colors[i, 2]
-    return sums
+    n_points, n_blocks = cells.shape[0], (n_cells + block - 1) // block
+    places = np.zeros((_PARTS, n_blocks), np.int64)
+    for part in prange(_PARTS):
+        for i in range(part * n_points // _PARTS, (part + 1) * n_points // _PARTS):
+            if cells[i] >= 0:
+                places[part, cells[i] // block] += 1
+    starts = np.zeros(n_blocks + 1, np.int64)
+    total = 0
+    for number in range(n_blocks):
+        starts[number] = total
+        for part in range(_PARTS):
+            count = places[part, number]
+            places[part, number] = total
+            total += count
+    starts[n_blocks] = total
+    cell, up = np.empty(total, np.int32), np.empty(total, np.float32)
+    rgb = np.empty((total if colors.shape[0] > 0 else 0, 3), np.uint8)
+    for part in prange(_PARTS):
+        for i in range(part * n_points // _PARTS, (part + 1) * n_points // _PARTS):
+            if cells[i] >= 0:
+                number = cells[i] // block
+                place = places[part, number]
+                places[part, number] = place + 1
+                cell[place] = cells[i]
+                up[place] = points[i, 2]
+                if colors.shape[0] > 0:
+                    rgb[place, 0] = colors[i, 0]
+                    rgb[place, 1] = colors[i, 1]
+                    rgb[place, 2] = colors[i, 2]
+    return SortedPoints(starts, cell, up, rgb)
 
 
 @jit(parallel=True, nogil=True)
-def cell_means(
-    sums: Float32, height: Float32, samples: NDArray[np.uint16], color: UInt8, color_valid: Bool
-) -> None:
-    """Turn sums into means; `color` may be empty, all arrays are flat over the cells."""
-    for cell in prange(sums.shape[0]):
-        count = sums[cell, 1]
-        if count > 0.0:
-            height[cell] = sums[cell, 0] + sums[cell, 2] / count
-            samples[cell] = min(int(count), 65535)
-            if color.shape[0] > 0:
-                color_valid[cell] = True
-                for k in range(3):
-                    color[cell, k] = int(sums[cell, 3 + k] / count + 0.5)
+def top_means(points: SortedPoints, layer: float, block: int, out: CellArrays) -> None:
+    """Mean height and color of the points within `layer` below each cell's highest."""
+    starts, cells, up, rgb = points.starts, points.cells, points.up, points.rgb
+    for number in prange(len(starts) - 1):
+        first, size = number * block, min(block, out.height.shape[0] - number * block)
+        top = np.full(size, -np.inf, np.float32)
+        for i in range(starts[number], starts[number + 1]):
+            cell = cells[i] - first
+            top[cell] = max(top[cell], up[i])
+        sums = np.zeros((size, 5))  # count, height less the top, red, green, blue
+        for i in range(starts[number], starts[number + 1]):
+            cell = cells[i] - first
+            below = up[i] - top[cell]
+            if below >= -layer:
+                sums[cell, 0] += 1.0
+                sums[cell, 1] += below
+                if rgb.shape[0] > 0:
+                    sums[cell, 2] += rgb[i, 0]
+                    sums[cell, 3] += rgb[i, 1]
+                    sums[cell, 4] += rgb[i, 2]
+        for cell in range(size):
+            count = sums[cell, 0]
+            if count > 0.0:
+                out.height[first + cell] = top[cell] + sums[cell, 1] / count
+                out.samples[first + cell] = min(int(count), 65535)
+                if rgb.shape[0] > 0:
+                    out.color_valid[first + cell] = True
+                    for k in range(3):
+                        out.color[first + cell, k] = int(sums[cell, 2 + k] / count + 0.5)

@@ -179,13 +179,19 @@ def mesh_arrays(mesh: Mesh, points: Float64, *, with_colors: bool) -> MeshArrays
     """Gather what the kernels need of a mesh, with empty arrays for what it lacks."""
     from meshreg.raster.shade_kernels import MeshArrays
 
-    colors = mesh.colors if with_colors else None
+    def or_empty(array: Any, dtype: Any, *shape: int) -> Any:
+        if array is not None:
+            return array
+        empty = np.empty(shape, dtype)
+        empty.flags.writeable = False  # as the records' arrays: another type is compiled anew
+        return empty
+
     return MeshArrays(
         points,
         mesh.faces,
-        np.empty((0, 3, 2), np.float32) if mesh.uv is None else mesh.uv,
-        np.empty(0, np.int32) if mesh.face_texture is None else mesh.face_texture,
-        np.empty((0, 3), np.uint8) if colors is None else colors,
+        or_empty(mesh.uv, np.float32, 0, 3, 2),
+        or_empty(mesh.face_texture, np.int32, 0),
+        or_empty(mesh.colors if with_colors else None, np.uint8, 0, 3),
     )
 
 

@@ -263,38 +263,52 @@ def page_spans(uv: Float32, face_page: Int32, n_pages: int) -> Float64:
     return spans
 
 
-@jit(nogil=True)
-def covered(uv: Float32, face_page: Int32, page: int, height: int, width: int) -> UInt8:
-    """Set to 1 the texels of a page that its faces touch, (height, width)."""
+@jit(parallel=True, nogil=True)
+def covered(uv: Float32, face_page: Int32, page: int, size: tuple[int, int], workers: int) -> UInt8:
+    """Set to 1 the texels of a page of `size` (height, width) that its faces touch.
+
+    Each worker looks at all faces and keeps to its own stripe of rows.
+    """
+    height, width = size
     used = np.zeros((height, width), np.uint8)
-    x = np.empty(3, np.float64)
-    y = np.empty(3, np.float64)
-    for f in range(face_page.shape[0]):
-        if face_page[f] != page:
-            continue
-        for k in range(3):
-            x[k] = uv[f, k, 0] * width
-            y[k] = (1.0 - uv[f, k, 1]) * height
-        first = max(math.floor(y.min()), 0)
-        last = min(math.floor(y.max()), height - 1)
-        for row in range(first, last + 1):
-            # The face within this row of texels: its corners and its edges' ends there.
-            west, east = np.inf, -np.inf
+    for worker in prange(workers):
+        top_row, end_row = worker * height // workers, (worker + 1) * height // workers
+        x = np.empty(3, np.float64)
+        y = np.empty(3, np.float64)
+        for f in range(face_page.shape[0]):
+            if face_page[f] != page:
+                continue
             for k in range(3):
-                ax, ay, bx, by = x[k], y[k], x[(k + 1) % 3], y[(k + 1) % 3]
-                if ay > by:
-                    ax, ay, bx, by = bx, by, ax, ay
-                top, bottom = max(ay, float(row)), min(by, row + 1.0)
-                if top > bottom:
-                    continue
-                slope = (bx - ax) / (by - ay) if by > ay else 0.0
-                one, two = ax + (top - ay) * slope, ax + (bottom - ay) * slope
-                if by == ay:
-                    two = bx
-                west, east = min(west, one, two), max(east, one, two)
-            for col in range(max(math.floor(west), 0), min(math.floor(east), width - 1) + 1):
-                used[row, col] = 1
+                y[k] = (1.0 - uv[f, k, 1]) * height
+            first = max(math.floor(min(y[0], y[1], y[2])), top_row)
+            last = min(math.floor(max(y[0], y[1], y[2])), end_row - 1)
+            if first > last:
+                continue
+            for k in range(3):
+                x[k] = uv[f, k, 0] * width
+            for row in range(first, last + 1):
+                west, east = _span_in_row(x, y, float(row))
+                for col in range(max(math.floor(west), 0), min(math.floor(east), width - 1) + 1):
+                    used[row, col] = 1
     return used
+
+
+@jit(nogil=True)
+def _span_in_row(x: Float64, y: Float64, row: float) -> tuple[float, float]:
+    """From where to where a triangle reaches between y = row and row + 1; infinite: nowhere."""
+    west, east = np.inf, -np.inf
+    for k in range(3):
+        m = (k + 1) % 3
+        ax, ay, bx, by = x[k], y[k], x[m], y[m]
+        if ay > by:
+            ax, ay, bx, by = bx, by, ax, ay
+        top, bottom = max(ay, row), min(by, row + 1.0)
+        if top <= bottom:  # this edge passes here
+            slope = (bx - ax) / (by - ay) if by > ay else 0.0
+            one = ax + (top - ay) * slope
+            two = ax + (bottom - ay) * slope if by > ay else bx
+            west, east = min(west, one, two), max(east, one, two)
+    return west, east
 
 
 @jit(parallel=True, nogil=True)

@@ -118,6 +118,8 @@ def _averaged(mesh: Mesh, plan: PagePlan, image: UInt8, alpha: UInt8 | None) -> 
 
     Without that a block at the edge of an atlas chart would take in the filling beside it.
     """
+    import numba
+
     from meshreg.raster.shade_kernels import covered, shrunk
 
     assert mesh.uv is not None
@@ -125,6 +127,7 @@ def _averaged(mesh: Mesh, plan: PagePlan, image: UInt8, alpha: UInt8 | None) -> 
     if plan.wraps:
         used = np.ones(image.shape[:2], np.uint8)
     else:
-        used = covered(mesh.uv, mesh.face_texture, plan.index, image.shape[0], image.shape[1])
+        workers = numba.get_num_threads()
+        used = covered(mesh.uv, mesh.face_texture, plan.index, image.shape[:2], workers)
     seen = used if alpha is None else used * alpha
     return shrunk(np.ascontiguousarray(image), used, seen, plan.times)

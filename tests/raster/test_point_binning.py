@@ -92,7 +92,7 @@ def test_the_order_of_points_and_the_threads_change_nothing(monkeypatch):
         two = rasterize(survey, grid)
     finally:
         numba.set_num_threads(threads)
-    monkeypatch.setattr(module, "_SLAB_CELLS", 700)
+    monkeypatch.setattr(module, "_BLOCK_CELLS", 77)
     three = rasterize(survey, grid)
     for other in (two, three):
         np.testing.assert_array_equal(other.height, one.height)

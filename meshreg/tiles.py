@@ -1,0 +1,255 @@
+"""How far each tile of the moving survey must go, measured alone.
+
+Two measures: correlation, which finds a tile from up to ±1° of yaw away, and Gauss-Newton on
+high-passed heights, which then reads it to a hundredth of a cell. High-passing takes out the warp
+and doming that bias a fit of raw heights by centimetres; working tile by tile keeps the internal
+horizontal warp of the models from bending a single global fit toward where they happen to agree.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from meshreg.offsets import neutral
+from meshreg.offsets.channels import high_pass
+from meshreg.offsets.correlate import Correlator, Window
+from meshreg.offsets.surface import MAD_TO_SIGMA, find_peak
+from meshreg.types import Bool, Float64, Grid, SurveyRaster
+
+MAX_YAW = np.deg2rad(1.0)
+HIGH_PASS = 2.0  # cells: finer than any warp, coarser than the noise of single cells
+TILE_CELLS = 36  # at most; on small patches at least 7 tiles a side as long as they hold 16 cells
+
+
+@dataclass(frozen=True, eq=False)
+class TileOffsets:
+    """How far each tile must go.
+
+    Attributes
+    ----------
+    places : (M, 2) float64
+        Centres of the moving tiles, absolute east and north [m].
+    offsets : (M, 2) float64
+        East and north [m] to add to moving coordinates.
+    block : (M,) int
+        Tiles at the same place share a block, whichever channel saw them.
+    channel : (M,) int
+        Which of the channels matched it.
+    """
+
+    places: Float64
+    offsets: Float64
+    block: np.ndarray
+    channel: np.ndarray
+
+
+@dataclass(frozen=True)
+class Overlap:
+    """The moving cells that fall on the reference at an offset, to the cell.
+
+    `rows` and `cols` are (low, high) in the moving raster; `shift` takes a moving cell's row and
+    column to the reference's; `offset` is the (east, north) that this means exactly [m].
+    """
+
+    rows: tuple[int, int]
+    cols: tuple[int, int]
+    shift: tuple[int, int]
+    offset: tuple[float, float]
+
+    @classmethod
+    def at(cls, reference: Grid, moving: Grid, offset: tuple[float, float]) -> Overlap:
+        """Return the overlap at the whole-cell offset nearest to `offset`."""
+        cell = moving.cell
+        nominal = Window.around(reference, moving, cell)
+        steps = round(offset[1] / cell), round(offset[0] / cell)
+        row, col = int(nominal.rows[1]) - steps[0], int(nominal.cols[1]) + steps[1]
+        rows = max(0, -row), min(moving.shape[0], reference.shape[0] - row)
+        cols = max(0, -col), min(moving.shape[1], reference.shape[1] - col)
+        return cls(rows, cols, (row, col), (steps[1] * cell, steps[0] * cell))
+
+    @property
+    def side(self) -> int:
+        """Cells along the shorter side; not positive where nothing overlaps."""
+        return min(self.rows[1] - self.rows[0], self.cols[1] - self.cols[0])
+
+    def tiles(self, side: int) -> list[tuple[int, int]]:
+        """Top left corners of the whole tiles of `side` cells."""
+        return [
+            (top, left)
+            for top in range(self.rows[0], self.rows[1] - side + 1, side)
+            for left in range(self.cols[0], self.cols[1] - side + 1, side)
+        ]
+
+
+def correlated_tiles(
+    reference: SurveyRaster,
+    moving: SurveyRaster,
+    channel: neutral.Channel,
+    offset: tuple[float, float],
+) -> TileOffsets | None:
+    """Match each tile by the neutral measure, within the reach of a yaw of ±1°."""
+    overlap = Overlap.at(reference.grid, moving.grid, offset)
+    if overlap.side < 32:
+        return None
+    first, second = neutral.fields(reference, channel), neutral.fields(moving, channel)
+    side = int(np.clip(overlap.side // 5, 16, 128))
+    span = overlap.rows[1] - overlap.rows[0], overlap.cols[1] - overlap.cols[0]
+    reach = int(np.ceil(0.5 * np.hypot(*span) * MAX_YAW)) + 3
+    found = []
+    for top, left in overlap.tiles(side):
+        step = _correlate_tile(first, second, (top, left, side), overlap, reach, moving.grid.cell)
+        if step is not None:
+            middle = moving.grid.east_north(top + 0.5 * (side - 1), left + 0.5 * (side - 1))
+            found.append((*middle, overlap.offset[0] + step[0], overlap.offset[1] + step[1]))
+    return _as_tiles(found, int(channel == "image"))
+
+
+def _correlate_tile(
+    first: neutral.Fields,
+    second: neutral.Fields,
+    tile: tuple[int, int, int],
+    overlap: Overlap,
+    reach: int,
+    cell: float,
+) -> tuple[float, float] | None:
+    """Offset (east, north) [m] of one tile from the common shift; None where it has no peak."""
+    top, left, side = tile
+    shift = overlap.shift
+    up, west = max(0, top + shift[0] - reach), max(0, left + shift[1] - reach)
+    big = (
+        slice(up, top + shift[0] + side + reach),
+        slice(west, left + shift[1] + side + reach),
+    )
+    small = (slice(top, top + side), slice(left, left + side))
+    a, b = first.mapped(lambda f: f[big]), second.mapped(lambda f: f[small])
+    if b.mask.mean() < 0.5 or a.mask.mean() < 0.5:
+        return None
+    steps = np.arange(-reach, reach + 1)
+    window = Window(
+        cell,
+        steps + (top + shift[0] - up),
+        steps + (left + shift[1] - west),
+        np.asarray(steps * cell, np.float64),
+        np.asarray(-steps * cell, np.float64),
+        (a.mask.shape, b.mask.shape),
+    )
+    correlator = Correlator(window)
+    surface, _ = neutral.surface(
+        neutral.spectra(a, correlator), neutral.spectra(b, correlator), correlator, 0.5
+    )
+    peak = find_peak(surface, window.east, window.north, exclusion=3 * cell)
+    if peak is None or peak.border or peak.gap < 0.5:
+        return None
+    return peak.east, peak.north
+
+
+def polished_tiles(
+    reference: SurveyRaster,
+    moving: SurveyRaster,
+    offset: Float64,
+    yaw: float,
+    pivot: Float64,
+) -> TileOffsets | None:
+    """Read each tile's offset by robust Gauss-Newton on high-passed heights.
+
+    Starts from the rigid motion (`offset` [m] at `pivot`, `yaw` [rad]); a tile that runs more than
+    three cells from it, or shows too little, is left out.
+    """
+    overlap = Overlap.at(reference.grid, moving.grid, (float(offset[0]), float(offset[1])))
+    side = int(np.clip(overlap.side // 7, 16, TILE_CELLS))
+    if overlap.side < 3 * side:
+        return None
+    still, moved = _Relief.of(reference), _Relief.of(moving)
+    found = []
+    for top, left in overlap.tiles(side):
+        part = (slice(top, top + side), slice(left, left + side))
+        middle = np.array(moving.grid.east_north(top + 0.5 * (side - 1), left + 0.5 * (side - 1)))
+        arm = middle - pivot
+        start = offset + yaw * np.array([-arm[1], arm[0]])
+        answer = _polish(still, moved, part, middle, start, yaw)
+        if answer is not None and np.hypot(*(answer - start)) <= 3 * moving.grid.cell:
+            found.append((*middle, *answer))
+    return _as_tiles(found, 0)
+
+
+@dataclass(frozen=True, eq=False)
+class _Relief:
+    """High-passed heights as a cubic spline, their slopes per metre, and where they are known."""
+
+    grid: Grid
+    field: Float64
+    spline: Float64
+    d_east: Float64
+    d_north: Float64
+    mask: Bool
+
+    @classmethod
+    def of(cls, raster: SurveyRaster) -> _Relief:
+        from scipy.ndimage import binary_erosion, spline_filter
+
+        mask = raster.valid
+        height = raster.height.astype(np.float64)
+        height = np.where(mask, height - (np.median(height[mask]) if mask.any() else 0.0), 0.0)
+        field = high_pass(height, mask, HIGH_PASS)
+        d_row, d_col = np.gradient(field)
+        inner = binary_erosion(mask, iterations=3, border_value=0)
+        cell = raster.grid.cell
+        return cls(raster.grid, field, spline_filter(field, 3), d_col / cell, -d_row / cell, inner)
+
+
+def _polish(
+    still: _Relief,
+    moved: _Relief,
+    part: tuple[slice, slice],
+    middle: Float64,
+    offset: Float64,
+    yaw: float,
+) -> Float64 | None:
+    """Offset [m] at the tile's middle that lays its heights on the reference's.
+
+    Residual ``r = f1(R u + t) - f2(u)``, Tukey's biweight at four robust deviations, slopes as
+    the mean of both surveys' (so that neither survey's noise shrinks the step).
+    """
+    from scipy.ndimage import map_coordinates
+
+    row, col = np.nonzero(moved.mask[part])
+    if len(row) < 0.5 * (part[0].stop - part[0].start) ** 2:
+        return None
+    row, col = row + part[0].start, col + part[1].start
+    east, north = moved.grid.east_north(row, col)
+    arm_east, arm_north = east - middle[0], north - middle[1]
+    east = middle[0] + np.cos(yaw) * arm_east - np.sin(yaw) * arm_north
+    north = middle[1] + np.sin(yaw) * arm_east + np.cos(yaw) * arm_north
+    value = moved.field[row, col]
+    slope = np.stack([moved.d_east[row, col], moved.d_north[row, col]], axis=1)
+    for _ in range(15):
+        place = np.stack(still.grid.row_col(east + offset[0], north + offset[1]))
+        near = np.rint(place).astype(int)
+        inside = ((near >= 0) & (still.grid.shape > near.T).T).all(axis=0)
+        inside[inside] = still.mask[near[0, inside], near[1, inside]]
+        if inside.sum() < 0.5 * len(row):
+            return None
+        at = place[:, inside]
+        residual = map_coordinates(still.spline, at, order=3, prefilter=False) - value[inside]
+        other = [map_coordinates(d, at, order=1) for d in (still.d_east, still.d_north)]
+        design = 0.5 * (slope[inside] + np.stack(other, axis=1))
+        spread = MAD_TO_SIGMA * float(np.median(np.abs(residual - np.median(residual))))
+        weight = np.clip(1 - (residual / max(4 * spread, 1e-12)) ** 2, 0, None) ** 2
+        normal = (design * weight[:, None]).T @ design
+        if not np.linalg.cond(normal) < 1e4:  # a single ridge tells only one direction
+            return None
+        step = -np.linalg.solve(normal, (design * weight[:, None]).T @ residual)
+        offset = offset + step
+        if np.abs(step).max() < 1e-7:
+            return offset
+    return offset if np.abs(step).max() < 0.01 * still.grid.cell else None
+
+
+def _as_tiles(found: list[tuple[float, ...]], channel: int) -> TileOffsets | None:
+    if not found:
+        return None
+    rows = np.array(found, float)
+    numbers = np.arange(len(rows))
+    return TileOffsets(rows[:, :2], rows[:, 2:], numbers, np.full(len(rows), channel))

@@ -1,0 +1,94 @@
+"""Tiles alone: sub-cell steps on a grid of tenths of a cell, in both directions."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import seafloor
+
+from meshreg.tiles import Overlap, correlated_tiles, polished_tiles
+from meshreg.types import Grid
+
+CELL = 0.1
+
+
+@pytest.mark.parametrize("tenths", [(0, 0), (1, 9), (3, -4), (5, 5), (-7, 2), (9, -9)])
+def test_tenths_of_a_cell(tenths):
+    """Every tile reads a shift of tenths of a cell to a fiftieth of a cell."""
+    east, north = (t * CELL / 10 for t in tenths)
+    floor = seafloor.Seafloor.random(3, size=16.0)
+    reference = floor.raster(CELL, 5.0, noise=0.0)
+    moving = floor.moved(-east, -north).raster(CELL, 5.0, noise=0.0, up=0.2)
+    found = polished_tiles(reference, moving, np.zeros(2), 0.0, np.zeros(2))
+    error = np.abs(found.offsets - (east, north))
+    assert error.max() < 0.02 * CELL
+    assert np.median(error) < 0.005 * CELL
+
+
+def test_a_survey_onto_itself_does_not_move_at_all():
+    reference = seafloor.Seafloor.random(3, size=16.0).raster(CELL, 5.0)
+    found = polished_tiles(reference, reference, np.zeros(2), 0.0, np.zeros(2))
+    assert np.abs(found.offsets).max() < 1e-9
+
+
+def test_heights_biased_in_proportion_to_themselves_do_not_drift():
+    """A vertical scale error of 1 % shifts Nuth and Kääb; the offset must not follow it."""
+    floor = seafloor.Seafloor.random(4, size=16.0)
+    reference = floor.raster(CELL, 5.0, noise=0.0)
+    moving = floor.moved(-0.03, 0.04).raster(CELL, 5.0, noise=0.0)
+    stretched = dataclasses.replace(moving, height=1.01 * moving.height)
+    plain, biased = (
+        polished_tiles(reference, m, np.zeros(2), 0.0, np.zeros(2)) for m in (moving, stretched)
+    )
+    assert np.abs(biased.offsets.mean(axis=0) - plain.offsets.mean(axis=0)).max() < 0.002 * CELL
+
+
+def test_disturbed_starts_end_at_one_answer():
+    floor = seafloor.Seafloor.random(5, size=16.0)
+    reference = floor.raster(CELL, 5.0, seed=1)
+    moving = floor.changed(6, 0.3).moved(-0.02, 0.01).raster(CELL, 5.0, seed=2)
+    answers = []
+    for start in ((0.0, 0.0), (0.08, -0.05), (-0.06, 0.07)):
+        answer = np.array(start)
+        for _ in range(4):
+            found = polished_tiles(reference, moving, answer, 0.0, np.zeros(2))
+            answer = np.median(found.offsets, axis=0)
+        answers.append(answer)
+    assert np.ptp(answers, axis=0).max() < 0.02 * CELL
+
+
+@pytest.mark.parametrize("channel", ["terrain", "image"])
+def test_correlated_tiles_find_the_offset_from_afar(channel):
+    floor = seafloor.Seafloor.random(7, size=16.0)
+    reference = floor.raster(CELL, 5.0, seed=1)
+    moving = floor.moved(-1.23, 0.71).raster(CELL, 5.0, seed=2)
+    found = correlated_tiles(reference, moving, channel, (1.3, -0.6))
+    error = np.median(found.offsets, axis=0) - (1.23, -0.71)
+    assert np.abs(error).max() < 0.1 * CELL
+    assert len(found.offsets) >= 12
+
+
+def test_overlap_is_the_cells_that_meet():
+    reference, moving = Grid(0, 0, 1.0, (10, 12)), Grid(3, -2, 1.0, (10, 12))
+    overlap = Overlap.at(reference, moving, (-1.0, 0.0))
+    # moved one cell west, the moving grid starts at column 2 and row 2 of the reference
+    assert overlap.shift == (2, 2)
+    assert overlap.rows == (0, 8)
+    assert overlap.cols == (0, 10)
+    assert overlap.offset == (-1.0, 0.0)
+    assert Overlap.at(reference, moving, (40.0, 0.0)).side <= 0
+
+
+def test_tiles_without_ground_are_left_out():
+    floor = seafloor.Seafloor.random(8, size=16.0)
+    reference = floor.raster(CELL, 5.0)
+    hole = np.ones(reference.grid.shape, bool)
+    hole[:, :50] = False
+    moving = dataclasses.replace(
+        reference, height=np.where(hole, reference.height, np.nan), valid=hole
+    )
+    found = polished_tiles(reference, moving, np.zeros(2), 0.0, np.zeros(2))
+    assert (found.places[:, 0] > -0.5).all()
+    assert len(found.places) >= 12
