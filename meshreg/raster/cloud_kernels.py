@@ -104,8 +104,10 @@ def sorted_points(
 def top_means(points: SortedPoints, layer: float, block: int, out: CellArrays) -> None:
     """Mean height and color of the points within `layer` below each cell's highest."""
     starts, cells, up, rgb = points.starts, points.cells, points.up, points.rgb
+    # Named outside the loop: numba 0.68 loses what is written through a tuple inside it.
+    height, samples, color, color_valid = out.height, out.samples, out.color, out.color_valid
     for number in prange(len(starts) - 1):
-        first, size = number * block, min(block, out.height.shape[0] - number * block)
+        first, size = number * block, min(block, height.shape[0] - number * block)
         top = np.full(size, -np.inf, np.float32)
         for i in range(starts[number], starts[number + 1]):
             cell = cells[i] - first
@@ -124,9 +126,9 @@ def top_means(points: SortedPoints, layer: float, block: int, out: CellArrays) -
         for cell in range(size):
             count = sums[cell, 0]
             if count > 0.0:
-                out.height[first + cell] = top[cell] + sums[cell, 1] / count
-                out.samples[first + cell] = min(int(count), 65535)
+                height[first + cell] = top[cell] + sums[cell, 1] / count
+                samples[first + cell] = min(int(count), 65535)
                 if rgb.shape[0] > 0:
-                    out.color_valid[first + cell] = True
+                    color_valid[first + cell] = True
                     for k in range(3):
-                        out.color[first + cell, k] = int(sums[cell, 2 + k] / count + 0.5)
+                        color[first + cell, k] = int(sums[cell, 2 + k] / count + 0.5)

@@ -1,4 +1,4 @@
-"""Rasterizing against Open3D's ray casting with a NumPy texture look-up, and the clouds' rate.
+"""Rasterizing: a textured mesh against Open3D's rays with a NumPy texture look-up, and clouds.
 
 Both sides get the same mesh and texture in memory, and answer with one sample a cell (height and
 color) on the same grid; meshreg's default, which takes four or more samples a cell, stands beside.
@@ -6,8 +6,11 @@ color) on the same grid; meshreg's default, which takes four or more samples a c
 
 from __future__ import annotations
 
-import time
+from collections.abc import Callable
+from functools import partial
+from typing import Any
 
+import measure
 import numpy as np
 
 from meshreg.raster import rasterize
@@ -76,55 +79,72 @@ def by_open3d(mesh: Mesh, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
     return height.reshape(grid.shape), color.reshape(*grid.shape, 3)
 
 
-def best_of(times, function):
-    """Least wall time [s] of a few runs, and the last result."""
-    best, result = np.inf, None
-    for _ in range(times):
-        start = time.perf_counter()
-        result = function()
-        best = min(best, time.perf_counter() - start)
-    return best, result
+def row(work: str, tool: str, call: Callable[[], Any], times: int = 3) -> tuple[dict, Any]:
+    """Run a few times; the least wall time [s], the highest rise of memory [MB], the last result."""
+    results: list[Any] = []
+
+    def once() -> None:
+        results[:] = [call()]
+
+    runs = [measure.here(once) for _ in range(times)]
+    found = {
+        "work": work,
+        "tool": tool,
+        "seconds": min(run["seconds"] for run in runs),
+        "peak MB": max(run["peak_mb"] for run in runs),
+        "note": "",
+    }
+    return found, results[0]
 
 
-def bench(faces: int = 4_000_000, page: int = 8192, cells: int = 4000, points: int = 20_000_000):
-    """Print the table rows; return them as (what, seconds, note)."""
-    rows = []
-    survey, size = textured_reef(faces, page, 40.0), 40.0
+def bench(
+    faces: int = 4_000_000, page: int = 8192, cells: int = 4000, points: int = 20_000_000
+) -> list[dict[str, Any]]:
+    """Return the rows of the table."""
+    size = 40.0
+    survey = textured_reef(faces, page, size)
     mesh = survey.geometry
     assert isinstance(mesh, Mesh)
     grid = Grid(0.0, size, size / cells, (cells, cells))
     placing = place(survey, grid, None, np.zeros(1))
     plain = RasterSettings(fill_cells=0, remove_floaters=False, mask_flat_color=False)
-    small = Grid(0.0, 4.0, 0.04, (100, 100))
-    rasterize(survey, small)  # compile
-
-    def one_sample():
-        return draw_mesh(mesh, placing, grid, measure_spacing(survey), plain, times=1)
-
-    ours, layers = best_of(3, one_sample)
-    megapixels = cells * cells / 1e6
-    rows.append((f"meshreg, 1 sample a cell ({megapixels:.0f} Mpx)", ours, ""))
-    default, raster = best_of(3, lambda: rasterize(survey, grid))
-    least = int(raster.samples.max())
-    rows.append((f"meshreg rasterize, {least} samples a cell, floaters and masks", default, ""))
+    spacing = measure_spacing(survey)
+    for times in (1, 2):  # compile
+        draw_mesh(mesh, placing, Grid(0.0, 4.0, 0.01, (100, 100)), spacing, plain, times)
+    rasterize(survey, Grid(0.0, 4.0, 0.04, (100, 100)))
+    work = f"{faces / 1e6:g} M triangles, {page}² texels, {cells * cells / 1e6:.0f} M cells"
+    one, layers = row(
+        f"{work}, 1 sample a cell",
+        "meshreg draw_mesh",
+        partial(draw_mesh, mesh, placing, grid, spacing, plain, 1),
+    )
+    default, raster = row(work, "meshreg rasterize", partial(rasterize, survey, grid))
+    default["note"] = f"{int(raster.samples.max())} samples a cell, floaters, masks, gaps"
+    rows = [one, default]
     try:
-        theirs, (height, _) = best_of(1, lambda: by_open3d(mesh, grid))
+        import open3d as _
     except ImportError as error:
-        rows.append(("Open3D RaycastingScene + NumPy", float("nan"), str(error)))
+        default["note"] += f"; Open3D is not here: {error}"
     else:
-        both = np.isfinite(height) & np.isfinite(layers.height)
-        off = np.abs(height - layers.height - placing.datum)[both]
-        note = f"{theirs / ours:.1f}x and {theirs / default:.1f}x meshreg's time; heights differ "
-        note += f"by over 1e-4 m at {np.mean(off > 1e-4):.1e} of samples"
-        rows.append(("Open3D RaycastingScene + NumPy, 1 ray a cell", theirs, note))
-    rows += bench_clouds(points, size)
-    for what, seconds, note in rows:
-        print(f"{what:62s} {seconds:8.2f} s  {note}")
-    return rows
+        peer, (height, _) = row(
+            f"{work}, 1 ray a cell",
+            "Open3D RaycastingScene + NumPy",
+            partial(by_open3d, mesh, grid),
+            times=2,
+        )
+        off = np.abs(height - layers.height - placing.datum)
+        off = off[np.isfinite(off)]
+        peer["note"] = (
+            f"{peer['seconds'] / one['seconds']:.1f} and "
+            f"{peer['seconds'] / default['seconds']:.1f} times as long; "
+            f"{np.count_nonzero(off > 1e-4)} of {off.size:,} heights differ by over 1e-4 m"
+        )
+        rows.append(peer)
+    return rows + bench_clouds(points, size)
 
 
-def bench_clouds(points: int, size: float):
-    """Points with color, in random order and along lines as scanners and most exports have them."""
+def bench_clouds(points: int, size: float) -> list[dict[str, Any]]:
+    """Colored points, in lines as scanners and most exports have them, and in random order."""
     rng = np.random.default_rng(1)
     rows = []
     for order in ("random order", "in lines"):
@@ -135,16 +155,14 @@ def bench_clouds(points: int, size: float):
         colors = rng.integers(0, 256, (points, 3), dtype=np.uint8)
         survey = Survey("cloud", PointCloud(np.column_stack([places, height]), colors))
         grid = Grid(0.0, size, size / 2000, (2000, 2000))
-        for what, settings in (
-            ("", RasterSettings()),
-            (", binning alone", RasterSettings(remove_floaters=False, fill_cells=0)),
-        ):
-            rasterize(survey, Grid(0, 1, 0.5, (2, 2)), settings)
-            seconds, _ = best_of(3, lambda s=settings: rasterize(survey, grid, s))
-            rate = f"{points / seconds / 1e6:.0f} M points/s"
-            rows.append((f"cloud of {points / 1e6:.0f} M, {order}{what}", seconds, rate))
+        rasterize(survey, Grid(0, 1, 0.5, (2, 2)))
+        work = f"{points / 1e6:.0f} M points to {grid.shape[0] ** 2 / 1e6:.0f} M cells, {order}"
+        found, _ = row(work, "meshreg rasterize", partial(rasterize, survey, grid))
+        found["note"] = f"{points / found['seconds'] / 1e6:.0f} M points/s"
+        rows.append(found)
     return rows
 
 
 if __name__ == "__main__":
-    bench()
+    for line in bench():
+        print(*line.values(), sep=" | ")
