@@ -9,6 +9,7 @@ horizontal warp of the models from bending a single global fit toward where they
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -193,7 +194,7 @@ class _Relief:
         height = raster.height.astype(np.float64)
         height = np.where(mask, height - (np.median(height[mask]) if mask.any() else 0.0), 0.0)
         field = high_pass(height, mask, HIGH_PASS)
-        d_row, d_col = np.gradient(field)
+        d_row, d_col = (np.asarray(d, np.float64) for d in np.gradient(field))
         inner = binary_erosion(mask, iterations=3, border_value=0)
         cell = raster.grid.cell
         return cls(raster.grid, field, spline_filter(field, 3), d_col / cell, -d_row / cell, inner)
@@ -247,7 +248,7 @@ def _polish(
     return offset if np.abs(step).max() < 0.01 * still.grid.cell else None
 
 
-def _as_tiles(found: list[tuple[float, ...]], channel: int) -> TileOffsets | None:
+def _as_tiles(found: list[tuple[Any, ...]], channel: int) -> TileOffsets | None:
     if not found:
         return None
     rows = np.array(found, float)

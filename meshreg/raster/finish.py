@@ -159,15 +159,28 @@ def flat_color(color: UInt8, seen: Bool, still: Bool, texel: float) -> Bool | No
     found = None
     for value in candidates:
         rgb = np.array([value >> 16, value >> 8 & 255, value & 255], np.uint8)
-        fill = _fill_of_color(color, seen, still, rgb, least, texel)
+        same = still & seen & (color == rgb).all(axis=2)
+        box = _box_around(same, 4 * math.ceil(_BLOCK_TEXELS * texel) + 16)
+        fill = _fill_of_color(color[box], seen[box], same[box], rgb, least, texel)
         if fill is not None:
-            found = fill if found is None else found | fill
+            found = np.zeros(seen.shape, bool) if found is None else found
+            found[box] |= fill
     return found
 
 
+def _box_around(where: Bool, margin: int) -> tuple[slice, slice]:
+    """Return the rows and columns that hold all True cells, and `margin` more on each side."""
+    sides = []
+    for axis in (1, 0):
+        there = np.flatnonzero(where.any(axis=axis))
+        sides.append(slice(max(int(there[0]) - margin, 0), int(there[-1]) + margin + 1))
+    return sides[0], sides[1]
+
+
 def _fill_of_color(
-    color: UInt8, seen: Bool, still: Bool, rgb: UInt8, least: float, texel: float
+    color: UInt8, seen: Bool, same: Bool, rgb: UInt8, least: float, texel: float
 ) -> Bool | None:
+    """Return the fill among the cells that are `same` as `rgb` throughout, if it is fill."""
     from scipy import ndimage
 
     def cells(texels: float) -> int:
@@ -181,7 +194,6 @@ def _fill_of_color(
         found[found] = _steps(color[found], rgb) <= levels
         return found
 
-    same = still & seen & (color == rgb).all(axis=2)
     width = max(5, cells(_FLAT_TEXELS)) | 1
     core = ndimage.minimum_filter(same, width, mode="constant")
     pieces = np.asarray(ndimage.maximum_filter(core, width, mode="constant"))
