@@ -228,7 +228,8 @@ def _polish(
     for _ in range(15):
         place = np.stack(still.grid.row_col(east + offset[0], north + offset[1]))
         near = np.rint(place).astype(int)
-        inside = ((near >= 0) & (still.grid.shape > near.T).T).all(axis=0)
+        rows, cols = still.grid.shape
+        inside = (near[0] >= 0) & (near[0] < rows) & (near[1] >= 0) & (near[1] < cols)
         inside[inside] = still.mask[near[0, inside], near[1, inside]]
         if inside.sum() < 0.5 * len(row):
             return None

@@ -115,13 +115,13 @@ def draw_severity(rows: Sequence[Row]) -> Any:
                 marker=marker, markersize=5, linewidth=1.2, elinewidth=0.8, capsize=2,
                 label=_name(method),
             )  # fmt: skip
-        axes.set_title(f"{preset} ({pairs} pairs a step)", fontsize=10)
+        axes.set_title(f"{preset} ({pairs} pair{'s' if pairs != 1 else ''} a step)", fontsize=10)
         axes.set_xlabel("severity")
         axes.set_ylim(-0.04, 1.04)
         axes.grid(alpha=0.25)
         if k == 0:
             axes.set_ylabel("share of successes")
-            axes.legend(fontsize=8, loc="lower left")
+            axes.legend(fontsize=8, loc="lower left", framealpha=0.9)
     return figure
 
 

@@ -151,7 +151,7 @@ def _table(job: Job, folder: Path) -> Record:
     for preset in job.presets:
         found[preset] = _register(job, pair.reference, pair.moving, preset)
         rows += measure.of_registration(found[preset], preset, pair.truth, clicked)
-    figures = maps.draw(job.scenario, found, folder / "figures")
+    figures = maps.draw(job.scenario, found, pair.truth["offset"], folder / "figures")
     stages = dict(found["robust"].seconds)
     about = _about(recipe, pair.truth, clicked)
     return about | {"rows": rows, "stages": stages, "figures": figures}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,9 @@ SECTION_EAST = 5.0  # m east of the map's south-west corner
 SURFACES = ("terrain", "mutual_information")
 
 
-def draw(site: str, found: Mapping[str, Registration], folder: Path) -> list[str]:
+def draw(
+    site: str, found: Mapping[str, Registration], truth: Sequence[float], folder: Path
+) -> list[str]:
     """Draw the figures of a site.
 
     Parameters
@@ -24,6 +26,8 @@ def draw(site: str, found: Mapping[str, Registration], folder: Path) -> list[str
     site : str
     found : mapping
         The registration by each preset; "robust" is the one whose rasters are shown.
+    truth : (east, north, up)
+        The true offset [m].
     folder : Path
 
     Returns
@@ -36,7 +40,7 @@ def draw(site: str, found: Mapping[str, Registration], folder: Path) -> list[str
         **{f"fig3_{site}_{name}": evidence.draw_matches(found[name]) for name in found},
         f"fig4_{site}_relief": overlays.draw_relief(robust),
         f"fig4_{site}_section": draw_section(robust),
-        f"fig5_{site}_scores": draw_surfaces(found),
+        f"fig5_{site}_scores": draw_surfaces(found, truth),
     }
     written = []
     for name, figure in figures.items():
@@ -87,22 +91,27 @@ def draw_section(registration: Registration, east: float = SECTION_EAST) -> Any:
     return figure
 
 
-def draw_surfaces(found: Mapping[str, Registration]) -> Any:
+def draw_surfaces(found: Mapping[str, Registration], truth: Sequence[float]) -> Any:
     """Score of every offset, a row a preset, a column a method (Figure 5)."""
     presets = [name for name in ("paper", "robust") if name in found]
     figure = style.new_figure(
-        9.6, 4.3 * len(presets) + 0.9, "Score of each offset", "bright: better    cross: the best"
+        9.6,
+        4.3 * len(presets) + 0.9,
+        "Score of each offset",
+        "bright: better    orange ring: the best    white dotted ring: the truth",
     )
     for row, preset in enumerate(presets):
         estimates = {e.method: e for e in found[preset].estimates}
         for col, method in enumerate(SURFACES):
             axes = figure.add_subplot(len(presets), len(SURFACES), row * len(SURFACES) + col + 1)
             axes.set_title(f"{preset}: {style.method_name(method)}", fontsize=10)
-            _surface(figure, axes, estimates.get(method))
+            _surface(figure, axes, estimates.get(method), truth)
     return figure
 
 
-def _surface(figure: Any, axes: Any, estimate: OffsetEstimate | None) -> None:
+def _surface(
+    figure: Any, axes: Any, estimate: OffsetEstimate | None, truth: Sequence[float]
+) -> None:
     shown = {} if estimate is None else estimate.evidence
     if estimate is None or "surface" not in shown or not np.isfinite(shown["surface"]).any():
         axes.text(0.5, 0.5, "no score", ha="center", va="center", transform=axes.transAxes)
@@ -124,11 +133,17 @@ def _surface(figure: Any, axes: Any, estimate: OffsetEstimate | None) -> None:
     axes.set_facecolor("#dddddd")
     figure.colorbar(picture, ax=axes, shrink=0.8)
     if best is not None:
-        mark: dict[str, Any] = {"s": 70, "edgecolors": "white", "linewidths": 1.0}
-        axes.scatter([best[0]], [best[1]], color=style.MOVING, marker="P", zorder=3, **mark)
+        axes.scatter([best[0]], [best[1]], s=110, facecolors="none", edgecolors=style.MOVING,
+                     linewidths=1.6, zorder=4)  # fmt: skip
         axes.set_xlabel(
             f"east [m]    {estimate.status}: ({best[0]:+.2f}, {best[1]:+.2f}) m", fontsize=9
         )
+    axes.scatter([truth[0]], [truth[1]], s=260, facecolors="none", edgecolors="white",
+                 linewidths=1.2, linestyles=":", zorder=3)  # fmt: skip
+    scored = np.isfinite(score)
+    seen_east, seen_north = east[scored.any(axis=0)], north[scored.any(axis=1)]
+    axes.set_xlim(seen_east.min() - half, seen_east.max() + half)
+    axes.set_ylim(seen_north.min() - half, seen_north.max() + half)
     axes.set_ylabel("north [m]", fontsize=9)
     axes.tick_params(labelsize=8)
 

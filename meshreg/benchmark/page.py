@@ -104,7 +104,8 @@ def _picture(path: Path, caption: str) -> str:
 
 
 def _title(stem: str) -> str:
-    return " ".join(stem.split("_")[1:])
+    figure, *rest = stem.split("_")
+    return f"Figure {figure[3:]}: {' '.join(rest)}"
 
 
 def _figures(drawn: Mapping[str, str], *names: str) -> str:

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from meshreg.benchmark import tables
-from meshreg.benchmark.plan import FLAT, LADDER
+from meshreg.benchmark.plan import FLAT
 
 Record = Mapping[str, Any]
 # What the numbers must be on all ground but flat sand: least share of the pairs.
@@ -87,7 +87,7 @@ def _verdicts(
     return {
         "all but flat sand": tables.verdicts(tables.fused(tables.not_flat(crossing))),
         "flat sand": tables.verdicts(tables.fused(flat)),
-        "severity ladder": tables.verdicts(tables.fused(tables.select(known, scenario=LADDER))),
+        "severity ladder": tables.verdicts(tables.fused(tables.select(known, kind="ladder"))),
         "all true pairs": tables.verdicts(tables.fused(known)),
         "different places": tables.verdicts(apart),
     }

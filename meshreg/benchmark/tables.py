@@ -14,14 +14,14 @@ from meshreg.io.atomic import atomic_file
 from meshreg.settings import METHODS
 
 Row = Mapping[str, Any]
-COLUMNS = tuple(
-    "kind scenario ground interval severity index seed format preset method status east north "
-    "true_east true_north yaw error error_hand error_up success covered sigma distance2 gap "
-    "terrain_gap image_gap score matches inliers inlier_share seconds verdict false_alarm "
-    "expected overlap warp_residual hand_residual reason places".split()
-)
+COLUMNS = (
+    "kind", "scenario", "ground", "interval", "severity", "index", "seed", "format", "preset",
+    "method", "status", "east", "north", "true_east", "true_north", "yaw", "error", "error_hand",
+    "error_up", "success", "covered", "sigma", "distance2", "gap", "terrain_gap", "image_gap",
+    "score", "matches", "inliers", "inlier_share", "seconds", "verdict", "false_alarm", "expected",
+    "overlap", "warp_residual", "hand_residual", "reason", "places",
+)  # fmt: skip
 ANSWERS = (*METHODS, "fused")
-TRUE_KINDS = ("crossing", "ladder", "scenario", "table", "files")
 
 
 def bounds(count: int, total: int, confidence: float = 0.95) -> tuple[float, float]:
