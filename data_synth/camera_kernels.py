@@ -1,5 +1,7 @@
 """Photographs of a heightfield: one ray a pixel, marched until it meets the ground."""
 
+# ruff: noqa: PLR0913, PLR0917 - compiled loops take their arrays one by one
+
 from __future__ import annotations
 
 import math

@@ -37,7 +37,7 @@ class Cameras:
 
 
 def lawn_mower(take: Take, tracks: int, images: int, heading: float = 0.0) -> Cameras:
-    """Fly over a footprint in `tracks` lines of `images`, so high that neighbours overlap by 60 %."""
+    """Fly `tracks` lines of `images` over a footprint, so high that neighbours overlap by 60 %."""
     west, south, east, north = take.footprint
     side = east - west
     middle = np.array([(west + east) / 2, (south + north) / 2, 0.0]) + take.distortion.start
@@ -165,7 +165,9 @@ def colmap_model(take: Take, view: View, folder: Path, count: int = 20_000) -> t
     for k in range(len(cameras.names)):
         seen = _sees(cameras, k, world, *lattice)
         rows.append([])
-        for p, (u, v) in zip(seen[0], seen[1] + 0.4 * rng.standard_normal(seen[1].shape), strict=True):
+        for p, (u, v) in zip(
+            seen[0], seen[1] + 0.4 * rng.standard_normal(seen[1].shape), strict=True
+        ):
             tracks_of[p].append((k, len(rows[-1])))
             rows[-1].append((float(u), float(v), int(p)))
     to_model = _arbitrary_frame(rng)
@@ -214,9 +216,7 @@ def _sees(
     uv += np.array([WIDTH / 2, HEIGHT / 2])
     inside = ahead & (uv > 0).all(axis=1) & (uv[:, 0] < WIDTH) & (uv[:, 1] < HEIGHT)
     index = np.flatnonzero(inside)
-    sight = visible(
-        world[index], z, lattice.step, lattice.west, lattice.north, cameras.centres[k]
-    )
+    sight = visible(world[index], z, lattice.step, lattice.west, lattice.north, cameras.centres[k])
     return index[sight], uv[index[sight]]
 
 

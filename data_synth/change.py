@@ -153,7 +153,8 @@ def _move(
 def _new_ground(ground: t.Ground, seed: int, change: Change) -> t.Ground:
     draws = uniform(np.arange(3), 32, seed)
     return ground._replace(
-        ripple_phase=ground.ripple_phase + change.ripples * (0.35 + 0.3 * draws[0] + 3.0 * draws[1]),
+        ripple_phase=ground.ripple_phase
+        + change.ripples * (0.35 + 0.3 * draws[0] + 3.0 * draws[1]),
         ripple_turn=ground.ripple_turn + change.ripples * 0.5 * (draws[2] - 0.5),
         mix=change.texture,
         mix_seed=int(seed + 5003),
@@ -220,4 +221,3 @@ def _added_events(added: Rows) -> tuple[Event, ...]:
         )
         for row in added
     )
-

@@ -55,8 +55,7 @@ def _boulder(f, dx, dy, finest):
         steep = 0.35 + 1.3 * hash01(k, 2, f.seed)
         reach = 0.55 + 0.5 * hash01(k, 3, f.seed)
         face = 0.35 + (reach - px * math.cos(angle) - py * math.sin(angle)) * steep
-        if face < up:
-            up = face
+        up = min(up, face)
     flat = 0.70 + 0.30 * hash01(9, 4, f.seed)
     tilt = 0.35 * (hash01(9, 5, f.seed) - 0.5) * px + 0.35 * (hash01(9, 6, f.seed) - 0.5) * py
     up = min(up, flat + tilt)
@@ -190,7 +189,7 @@ def _living(f, dx, dy, mark, finest):
     light = 0.55 + 0.7 * mark
     light *= 1.0 + 0.15 * fine + 0.08 * polyps
     r, g, b = f.red * light, f.green * light, f.blue * light
-    if f.kind == BRANCHING or f.kind == PLATE:
+    if f.kind in (BRANCHING, PLATE):
         pale = max(0.0, mark - 0.72) / 0.28
         pale = pale * pale * 0.55
         r, g, b = r + pale * (0.55 - r), g + pale * (0.50 - g), b + pale * (0.42 - b)
@@ -221,7 +220,7 @@ def feature_height(f, x, y, ground_z, finest):
     """Return the height of a feature at a point (or NOTHING) and the mark that its colour needs."""
     dx, dy = x - f.x, y - f.y
     kind = f.kind
-    if dx * dx + dy * dy > f.reach * f.reach or kind == SEDIMENT or kind == TURF:
+    if dx * dx + dy * dy > f.reach * f.reach or kind in (SEDIMENT, TURF):
         return NOTHING, 0.0
     base = f.z + 0.35 * (ground_z - f.z)
     if kind == BOULDER:

@@ -45,6 +45,13 @@ def _spots(x, y, ground, salt, cell, presence):
     return out
 
 
+@jit(nogil=True, inline="always", error_model="numpy")
+def _epoch_number(own, ground):
+    """Mix a lump's number 0..1 with another that is the epoch's own, of share `ground.mix`."""
+    other = own * 7919.13 + 0.1234567 * ground.mix_seed
+    return own + ground.mix * (other - np.floor(other) - own)
+
+
 @jit(nogil=True, error_model="numpy")
 def sand_height(x, y, ground, finest):
     """Height of the sand sheet [m] and the ripples' phase: 0 in the trough, 1 on the crest."""
@@ -103,7 +110,7 @@ def rock_height(x, y, ground, finest):
         if k >= 1:
             for i in range(n):
                 there = 0.6 if up[i] > 0.0 else 0.0
-                shade[i] += there * (own[i] - shade[i])
+                shade[i] += there * (_epoch_number(own[i], ground) - shade[i])
         if k == 1:  # some ground is smooth, some broken
             calm = _noise(x, y, ground.seed + 7, 1.6, finest, 0.6, 3)
             least = ground.broken_least
@@ -143,7 +150,7 @@ def _rubble(x, y, wx, wy, ground, finest, z, shade):
             for i in range(n):
                 z[i] += cover[i] * 0.28 * size * up[i]
                 there = cover[i] if up[i] > 0.0 else 0.0
-                shade[i] += there * (own[i] - shade[i])
+                shade[i] += there * (_epoch_number(own[i], ground) - shade[i])
     return cover
 
 

@@ -14,8 +14,7 @@ import numpy as np
 
 from data_synth import cameras as cams
 from data_synth.mesh import cloud, colored, make_nodes, make_surface, textured
-from data_synth.rasters import RasterPair as RasterPair
-from data_synth.rasters import make_rasters as make_rasters
+from data_synth.rasters import RasterPair, make_rasters
 from data_synth.recipe import Recipe
 from data_synth.regions import describe_change
 from data_synth.scene import Scene, Take, View, make_scene
@@ -50,7 +49,7 @@ def make_pair(
     recipe: Recipe,
     seed: int = 0,
     size: float | None = None,
-    format: str = "obj",  # noqa: A002 - the word that users type
+    format: str = "obj",
     progress: Progress | None = None,
 ) -> Pair:
     """Make a pair in memory.
@@ -88,7 +87,7 @@ def write_pair(
     folder: str | Path,
     seed: int = 0,
     size: float | None = None,
-    format: str | None = None,  # noqa: A002
+    format: str | None = None,
     progress: Progress | None = None,
     overwrite: bool = False,
 ) -> tuple[Path, ...]:
@@ -112,6 +111,8 @@ def write_pair(
         raise UsageError(f"Unknown format {kind!r}.", remedy=f"Use one of {', '.join(FORMATS)}.")
     if folder.exists() and not overwrite:
         raise UsageError("exists already.", file=folder, remedy="Choose another, or overwrite it.")
+    if folder.is_dir() and any(folder.iterdir()) and not (folder / "truth.json").is_file():
+        raise UsageError("holds something else than a made pair.", file=folder)
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
         work = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
@@ -219,3 +220,13 @@ def _survey(take: Take, scene: Scene, kind: str, tell: Progress) -> Survey:
         crs=place.crs,
         date=place.date if take.name == "reference" else place.date_moving,
     )
+
+
+__all__ = [
+    "FORMATS",
+    "Pair",
+    "RasterPair",
+    "make_pair",
+    "make_rasters",
+    "write_pair",
+]

@@ -22,7 +22,7 @@ PLATE_MIN = 0.15  # plates with a smaller radius stay without overhang [m]
 
 @dataclass(frozen=True, eq=False)
 class Nodes:
-    """Vertices on a wandering lattice: (R, C) arrays, centred [m], with `kept` where any was seen."""
+    """Vertices on a wandering lattice: (R, C) arrays, centred [m]; `kept` says what was seen."""
 
     east: Float64
     north: Float64
@@ -43,11 +43,12 @@ def make_nodes(take: Take, view: View) -> Nodes:
     e, n = np.meshgrid(np.arange(west, east + h, h), np.arange(north, south - h, -h))
     rng = np.random.default_rng([take.seed, 10])
     ex, nx = e.ravel(), n.ravel()
-    for axis, salt in ((e, 3), (n, 4)):
-        # a slow wander makes some ground dense and some sparse
-        wander = blotches(ex, nx, take.seed + salt, 1.2, 2).reshape(e.shape)
-        axis += 0.04 * sfm.uneven * np.clip(wander, -2.0, 2.0)  # gentle enough not to fold
-        axis += 0.25 * h * (2.0 * rng.random(e.shape) - 1.0)
+    place = [e.copy(), n.copy()]
+    for k, salt in enumerate((3, 4)):
+        # a slow wander makes some ground dense and some sparse; gentle enough not to fold
+        wander = np.clip(blotches(ex, nx, take.seed + salt, 1.2, 2), -2.0, 2.0).reshape(e.shape)
+        place[k] += 0.04 * sfm.uneven * wander + 0.25 * h * (2.0 * rng.random(e.shape) - 1.0)
+    e, n = place
     sigma = sfm.smoothing * h / lattice.step
     smooth = cv2.GaussianBlur(view.up, (0, 0), sigma) if sigma > 0.3 else view.up
     row, col = (lattice.north - n) / lattice.step, (e - lattice.west) / lattice.step
@@ -90,13 +91,11 @@ def make_surface(take: Take, nodes: Nodes) -> Surface:
         faces.append(face + start)
         start += len(corner)
     used, again = np.unique(np.concatenate(faces), return_inverse=True)
-    return Surface(
-        np.concatenate(vertices)[used], again.reshape(-1, 3).astype(np.int32)
-    )
+    return Surface(np.concatenate(vertices)[used], again.reshape(-1, 3).astype(np.int32))
 
 
 def _quads(nodes: NDArray[np.generic]) -> NDArray[np.generic]:
-    """The four corners (4, R-1, C-1) of each lattice square: NW, NE, SW, SE."""
+    """Return the four corners (4, R-1, C-1) of each lattice square: NW, NE, SW, SE."""
     return np.stack([nodes[:-1, :-1], nodes[:-1, 1:], nodes[1:, :-1], nodes[1:, 1:]])
 
 
@@ -121,7 +120,7 @@ def _walls(nodes: Nodes) -> Bool:
 def _overhangs(
     take: Take, nodes: Nodes, number: Int32, whole: Bool, wall: Bool
 ) -> list[tuple[Float64, Int32]]:
-    """The ground below each plate's rim, and the plate's underside 3 cm below its top."""
+    """Return the ground below each plate's rim, and the plate's underside 3 cm below its top."""
     from scipy.ndimage import binary_dilation
 
     things = take.seafloor.features
@@ -241,7 +240,7 @@ def colors_at(view: View, points: Float64, width: float) -> UInt8:
 
 
 def cloud(take: Take, view: View, spacing: float, origin: Float64) -> PointCloud:
-    """Return a dense cloud: one point a square of `spacing`, thinned unevenly, noisy, with strays."""
+    """Return a dense cloud: a point a square of `spacing`, thinned unevenly, noisy, with strays."""
     from data_synth.seeing_kernels import blotches
 
     west, south, east, north = take.footprint

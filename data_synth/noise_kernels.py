@@ -11,6 +11,8 @@ division by zero: only then are the loops of the `_into` functions vectorised, w
 four times as fast.
 """
 
+# ruff: noqa: PLR0913, PLR0917 - compiled loops take their arrays one by one
+
 from __future__ import annotations
 
 import numpy as np
@@ -136,7 +138,7 @@ def _lump(x, y, ix, iy, seed, presence):
 
 @jit(nogil=True, inline="always", error_model="numpy")
 def lumps(x, y, seed, presence):
-    """Rounded lumps, one or none a lattice cell: height 0..1, and the lump's own random number.
+    """Return the height 0..1 of rounded lumps, one or none a cell, and the lump's own number.
 
     A lump's radius is at most half a cell, so the four cells nearest the point are enough. The
     profile is flat with a steep foot, as coral rock has.

@@ -164,31 +164,40 @@ def _set(record: Any, key: str, parts: list[str], value: Any, path: Path) -> Any
     names = {f.name for f in fields(record)}
     if parts[0] not in names:
         raise UsageError(
-            f"Unknown recipe key {key!r}.", file=path, remedy=f"Use one of {', '.join(sorted(names))}."
+            f"Unknown recipe key {key!r}.",
+            file=path,
+            remedy=f"Use one of {', '.join(sorted(names))}.",
         )
     now = getattr(record, parts[0])
     if len(parts) > 1:
         if not is_dataclass(now):
             raise UsageError(f"Recipe key {key!r} has no part {parts[1]!r}.", file=path)
         return replace(record, **{parts[0]: _set(now, key, parts[1:], value, path)})
-    return replace(record, **{parts[0]: _fitted(now, value, key, path)})
+    drawn = next(f.type for f in fields(record) if f.name == parts[0]) == "Drawn"
+    return replace(record, **{parts[0]: _fitted(now, value, drawn, key, path)})
 
 
-def _fitted(now: Any, value: Any, key: str, path: Path) -> Any:
-    """Return `value` in the type of `now`, or say what was expected."""
+def _fitted(now: Any, value: Any, drawn: bool, key: str, path: Path) -> Any:
+    """Return `value` in the type of `now` (a range too where `drawn`), or say what was expected."""
     number = isinstance(value, int | float) and not isinstance(value, bool)
-    if isinstance(now, bool) and isinstance(value, bool):
-        return value
-    if isinstance(now, str) and isinstance(value, str):
-        return value
-    if isinstance(now, int) and not isinstance(now, bool) and isinstance(value, int):
-        return value
-    if isinstance(now, tuple) and isinstance(value, str):
-        return (value,)
-    if isinstance(value, list | tuple):
-        same = isinstance(now, tuple) and (len(now) == len(value) or isinstance(now[0], str))
-        if same or (isinstance(now, float) and len(value) == 2):
-            return tuple(value)
-    if number and (isinstance(now, float) or (isinstance(now, tuple) and len(now) == 2)):
+    numbers = isinstance(value, list | tuple) and all(isinstance(v, int | float) for v in value)
+    if isinstance(now, bool) or isinstance(now, str):
+        if type(value) is type(now):
+            return value
+    elif isinstance(now, int):
+        if number and float(value).is_integer():
+            return int(value)
+    elif drawn and numbers and len(value) == 2:
+        return (float(value[0]), float(value[1]))
+    elif (drawn or isinstance(now, float)) and number:
         return float(value)
-    raise UsageError(f"Recipe key {key!r} is {value!r}; expected something like {now!r}.", file=path)
+    elif isinstance(now, tuple) and now and isinstance(now[0], str):
+        if isinstance(value, str):
+            return (value,)
+        if isinstance(value, list | tuple) and all(isinstance(v, str) for v in value):
+            return tuple(value)
+    elif isinstance(now, tuple) and numbers and len(value) == len(now):
+        return tuple(float(v) for v in value)
+    raise UsageError(
+        f"Recipe key {key!r} is {value!r}; expected something like {now!r}.", file=path
+    )

@@ -35,13 +35,17 @@ def describe_change(scene: Scene, step: float | None = None) -> dict[str, Any]:
         return {"regions": [], "fields": {}, "total": None}
     step = max(0.03, scene.size / 500.0) if step is None else step
     west, south, east, north = scene.reference.footprint
-    x, y = np.meshgrid(np.arange(west + step / 2, east, step), np.arange(south + step / 2, north, step))
+    x, y = np.meshgrid(
+        np.arange(west + step / 2, east, step), np.arange(south + step / 2, north, step)
+    )
     before = scene.reference.seafloor.height(x, y, 0.0)
     gain = (scene.moving.seafloor.height(x, y, 0.0) - before) * step**2
     centre = scene.moving.distortion.centre
     regions = []
     for event in scene.events:
-        if any(west - r < ex < east + r and south - r < ey < north + r for ex, ey, r in event.circles):
+        if any(
+            west - r < ex < east + r and south - r < ey < north + r for ex, ey, r in event.circles
+        ):
             regions.append(_region(event, gain, (west, south, step), centre))
     change = scene.recipe.change
     fields: dict[str, Any] = {}

@@ -104,7 +104,10 @@ class Take:
         step = 0.10
         # whole multiples of the step, so that the strips of one survey meet without a seam
         e = np.arange(math.floor(east.min() / step) - 1, math.ceil(east.max() / step) + 2) * step
-        n = np.arange(math.ceil(north.max() / step) + 1, math.floor(north.min() / step) - 2, -1) * step
+        n = (
+            np.arange(math.ceil(north.max() / step) + 1, math.floor(north.min() / step) - 2, -1)
+            * step
+        )
         guess = np.zeros((len(n), len(e)))
         linear, warp = self.distortion.linear, self.distortion.warp
         for _ in range(2):
@@ -117,9 +120,7 @@ class Take:
         )
         return fine
 
-    def sample(
-        self, lattice: Lattice, progress: Callable[[float], None] | None = None
-    ) -> View:
+    def sample(self, lattice: Lattice, progress: Callable[[float], None] | None = None) -> View:
         """Return what the survey shows of a lattice: worked in strips, to spare memory."""
         from data_synth.sfm_kernels import lattice_height
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -60,7 +59,6 @@ class Site:
     kelp: float = 0.0
     coral_size: float = 1.0
     cluster: float = 0.7  # 0 evenly strewn .. 1 in stands with bare ground between
-    near_light: float = 1.0
 
     def densities(self) -> dict[int, float]:
         """Return things per square metre by kind."""
@@ -234,9 +232,6 @@ def features_of(site: Site, seed: int, bounds: Bounds) -> NDArray[np.void]:
     return everything[np.argsort(everything["id"], kind="stable")]
 
 
-Evaluator = Callable[[Float64, Float64, float], tuple[Float64, NDArray[np.float32], NDArray[np.int32]]]
-
-
 def make_seafloor(site: Site, seed: int, bounds: Bounds) -> Seafloor:
     """Return the first epoch of the world `seed` within `bounds`."""
     return Seafloor(ground_of(site, seed), features_of(site, seed, bounds), bounds)
@@ -245,17 +240,52 @@ def make_seafloor(site: Site, seed: int, bounds: Bounds) -> Seafloor:
 SITES: dict[str, Site] = {
     "reef": Site(),
     "low_reef": replace(
-        Site(), relief=0.07, step=0.0, lump=0.13, boulder=0.0, massive=1.6, branching=1.4, plate=0.4,
-        coral_size=0.7, sand=0.18,
+        Site(),
+        relief=0.07,
+        step=0.0,
+        lump=0.13,
+        boulder=0.0,
+        massive=1.6,
+        branching=1.4,
+        plate=0.4,
+        coral_size=0.7,
+        sand=0.18,
     ),
     "boulders": replace(
-        Site(), relief=0.12, step=0.0, lump=0.05, lump_gain=0.5, boulder=1.1, massive=0.0, branching=0.0,
-        plate=0.0, encrusting=1.2, soft=0.3, sponge=0.8, urchin=0.8, kelp=0.15, sand=0.25,
-        tone=(0.78, 0.72, 0.62), sand_tone=(0.36, 0.33, 0.27), coralline=0.45, rubble=0.35,
+        Site(),
+        relief=0.12,
+        step=0.0,
+        lump=0.05,
+        lump_gain=0.5,
+        boulder=1.1,
+        massive=0.0,
+        branching=0.0,
+        plate=0.0,
+        encrusting=1.2,
+        soft=0.3,
+        sponge=0.8,
+        urchin=0.8,
+        kelp=0.15,
+        sand=0.25,
+        tone=(0.78, 0.72, 0.62),
+        sand_tone=(0.36, 0.33, 0.27),
+        coralline=0.45,
+        rubble=0.35,
     ),
     "reef_and_sand": replace(Site(), sand=0.45, step=0.35, step_level=0.3, massive=0.9),
     "sand": replace(
-        Site(), relief=0.02, step=0.0, lump=0.02, sand=1.0, massive=0.0, branching=0.0, plate=0.0,
-        encrusting=0.0, soft=0.0, sponge=0.0, urchin=0.02, rubble=0.0,
+        Site(),
+        relief=0.02,
+        step=0.0,
+        lump=0.02,
+        sand=1.0,
+        massive=0.0,
+        branching=0.0,
+        plate=0.0,
+        encrusting=0.0,
+        soft=0.0,
+        sponge=0.0,
+        urchin=0.02,
+        rubble=0.0,
     ),
 }

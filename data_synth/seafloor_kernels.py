@@ -1,5 +1,7 @@
 """Ground and features together, at any number of points."""
 
+# ruff: noqa: PLR0913, PLR0917 - compiled loops take their arrays one by one
+
 from __future__ import annotations
 
 import numpy as np
@@ -31,15 +33,15 @@ def _cell(x, y, corner, bins):
 
 @jit(nogil=True, error_model="numpy")
 def _lay(x, y, ground, index, finest, z, sandy):
-    """Lay sediment and turf patches on `z`, in place; return their shares (N,) and whether any."""
+    """Lay sediment and turf patches on `z`, in place; say how much lies where (N,)."""
     features, starts, members, corner, bins = index
     dust, turf = np.zeros(x.size), np.zeros(x.size)
-    any_dust, any_turf = False, False
+    any_turf = False
     for i in range(x.size):
         cell = _cell(x[i], y[i], corner, bins)
         for k in range(starts[cell], starts[cell + 1]):
             f = features[members[k]]
-            if f.kind != SEDIMENT and f.kind != TURF:
+            if f.kind not in (SEDIMENT, TURF):
                 continue
             share = _laid(f, x[i], y[i], finest)
             if share <= 0.0:
@@ -47,25 +49,19 @@ def _lay(x, y, ground, index, finest, z, sandy):
             if f.kind == SEDIMENT:
                 z[i] += f.height * share
                 dust[i] = max(dust[i], share)
-                any_dust = True
             else:
                 tuft = octaves(x[i], y[i], ground.seed + 80, 0.06, finest, 0.75, 4)
                 z[i] += f.height * share * (1.0 - sandy[i]) * (1.0 + 0.25 * tuft)
                 turf[i] = max(turf[i], share)
                 any_turf = True
-    return dust, turf, any_dust, any_turf
+    return dust, turf, any_turf
 
 
 @jit(nogil=True, error_model="numpy")
-def _block(x, y, ground, index, finest, with_color, height, color, winner):
-    """Evaluate one block of points into `height`, `color` and `winner`."""
+def _stand(x, y, index, finest, z, height, mark, winner):
+    """Put the highest of ground and features into `height`, with its mark and its number."""
     features, starts, members, corner, bins = index
-    n = x.size
-    z, sandy, crest, shade, cover = ground_block(x, y, ground, finest)
-    dust, turf, any_dust, any_turf = _lay(x, y, ground, index, finest, z, sandy)
-    mark = np.zeros(n)
-    paint_x, paint_y = x.copy(), y.copy()
-    for i in range(n):
+    for i in range(x.size):
         cell = _cell(x[i], y[i], corner, bins)
         top, who = z[i], -1
         for k in range(starts[cell], starts[cell + 1]):
@@ -74,35 +70,52 @@ def _block(x, y, ground, index, finest, with_color, height, color, winner):
             if up > top and up > NOTHING:
                 top, who, mark[i] = up, members[k], m
         height[i], winner[i] = top, who
-        if who >= 0 and features[who].kind == BOULDER:
-            # a boulder carries its own skin with it
-            f = features[who]
-            paint_x[i], paint_y[i] = x[i] - f.x + 37.0 * (f.seed % 97), y[i] - f.y
-            shade[i], cover[i] = 0.5 + 0.5 * (top - f.z) / f.height, 0.0
+
+
+@jit(nogil=True, error_model="numpy")
+def _paint(x, y, features, finest, mark, winner, color):
+    """Colour what stands on the ground, in place; boulders only tint the rock that is there."""
+    for i in range(x.size):
+        if winner[i] < 0:
+            continue
+        f = features[winner[i]]
+        if f.kind == BOULDER:
+            color[i, 0] *= f.red
+            color[i, 1] *= f.green
+            color[i, 2] *= f.blue
+        else:
+            r, g, b = feature_color(f, x[i] - f.x, y[i] - f.y, mark[i], finest)
+            color[i, 0], color[i, 1], color[i, 2] = r, g, b
+
+
+@jit(nogil=True, error_model="numpy")
+def _block(x, y, ground, index, finest, with_color, height, color, winner):
+    """Evaluate one block of points into `height`, `color` and `winner`."""
+    features = index[0]
+    z, sandy, crest, shade, cover = ground_block(x, y, ground, finest)
+    dust, turf, any_turf = _lay(x, y, ground, index, finest, z, sandy)
+    mark = np.zeros(x.size)
+    _stand(x, y, index, finest, z, height, mark, winner)
     if not with_color:
         return
-    rock_color(paint_x, paint_y, ground, shade, cover, finest, color)
+    skin_x, skin_y = x.copy(), y.copy()
+    for i in range(x.size):
+        if winner[i] >= 0 and features[winner[i]].kind == BOULDER:
+            # a boulder carries its own skin with it
+            f = features[winner[i]]
+            skin_x[i], skin_y[i] = x[i] - f.x + 37.0 * (f.seed % 97), y[i] - f.y
+            shade[i], cover[i] = 0.5 + 0.5 * (height[i] - f.z) / f.height, 0.0
+    rock_color(skin_x, skin_y, ground, shade, cover, finest, color)
     if any_turf:
         add_turf(x, y, ground, shade, turf, finest, color)
-    most = 0.0
-    for i in range(n):
-        bare = 0.0 if winner[i] >= 0 else 1.0
+    for i in range(x.size):
         if sandy[i] < dust[i]:
             crest[i] = 0.5
-        sandy[i] = bare * smoothstep(0.15, 0.6, max(sandy[i], 0.92 * dust[i]))
-        most = max(most, sandy[i])
-    if most > 0.0:
+        covered = max(sandy[i], 0.92 * dust[i]) if winner[i] < 0 else 0.0
+        sandy[i] = smoothstep(0.15, 0.6, covered)
+    if sandy.max() > 0.0:
         add_sand(x, y, ground, sandy, crest, finest, color)
-    for i in range(n):
-        if winner[i] >= 0:
-            f = features[winner[i]]
-            if f.kind == BOULDER:
-                color[i, 0] *= f.red
-                color[i, 1] *= f.green
-                color[i, 2] *= f.blue
-            else:
-                r, g, b = feature_color(f, x[i] - f.x, y[i] - f.y, mark[i], finest)
-                color[i, 0], color[i, 1], color[i, 2] = r, g, b
+    _paint(x, y, features, finest, mark, winner, color)
 
 
 @jit(parallel=True, nogil=True, error_model="numpy")

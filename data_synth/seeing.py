@@ -178,8 +178,8 @@ def local_mean(height: Float32, sigma: float) -> Float32:
         height, (max(1, cols // times), max(1, rows // times)), interpolation=cv2.INTER_AREA
     )
     small = cv2.GaussianBlur(small, (0, 0), sigma / times)
-    mean = cv2.resize(small, (cols, rows), interpolation=cv2.INTER_LINEAR)
-    return mean
+    large: Float32 = cv2.resize(small, (cols, rows), interpolation=cv2.INTER_LINEAR)
+    return large
 
 
 def _strew_particles(linear: Float32, lattice: Lattice, seeing: Seeing, plan: Plan) -> None:

@@ -1,5 +1,7 @@
 """Light and water between the seafloor and the mosaic, per texel."""
 
+# ruff: noqa: PLR0913, PLR0917 - compiled loops take their arrays one by one
+
 from __future__ import annotations
 
 import math

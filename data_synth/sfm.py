@@ -44,7 +44,7 @@ class Sfm:
     mesh_spacing: float = 0.025
     smoothing: float = 0.6  # of the mesh against the texture, sigma in mesh spacings
     vertex_noise: float = 0.004
-    holes: float = 0.003 # share of the area
+    holes: float = 0.003  # share of the area
     ragged: float = 0.35  # depth of the edge's bays
     floaters: float = 2.0  # blobs in the water per 100 square metres
     uneven: float = 0.3  # 0 even sampling .. 1 very uneven
@@ -148,9 +148,7 @@ def rotation(yaw: float, tilt: float, heading: float) -> Float64:
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ lean
 
 
-def make_distortion(
-    sfm: Sfm, rng: np.random.Generator, centre: Float64, size: float
-) -> Distortion:
+def make_distortion(sfm: Sfm, rng: np.random.Generator, centre: Float64, size: float) -> Distortion:
     """Draw the distortion of one moving survey.
 
     Parameters

@@ -1,5 +1,7 @@
 """The distortion of a reconstruction, forward and back, at any number of points."""
 
+# ruff: noqa: PLR0913, PLR0917 - compiled loops take their arrays one by one
+
 from __future__ import annotations
 
 import math

@@ -46,7 +46,11 @@ def make_truth(scene: Scene, step: float = 0.25) -> dict[str, Any]:
     }
     if scene.recipe.place.other_ground or scene.recipe.sfm.mirrored or len(moving) < 3:
         truth.update(
-            reference_from_moving=None, similarity=None, centroid=None, residual_rms=None, offset=None
+            reference_from_moving=None,
+            similarity=None,
+            centroid=None,
+            residual_rms=None,
+            offset=None,
         )
         return truth
     rigid = best_fit(moving, reference, with_scale=False)
@@ -112,12 +116,14 @@ def best_fit(moving: Float64, reference: Float64, with_scale: bool) -> Float64:
 
 
 def _at_centre(scene: Scene) -> dict[str, Any]:
-    """The exact transform at the patch's centre: a point, its image, and the Jacobian there."""
+    """Return the exact transform at the patch's centre: a point, its image, the Jacobian."""
     d = scene.moving.distortion
     moving = d.moving_from_reference(d.centre[None])[0]
     h = 1e-3
     jacobian = [
-        (d.reference_from_moving((moving + s)[None]) - d.reference_from_moving((moving - s)[None]))[0]
+        (d.reference_from_moving((moving + s)[None]) - d.reference_from_moving((moving - s)[None]))[
+            0
+        ]
         / (2 * h)
         for s in h * np.eye(3)
     ]
@@ -130,7 +136,7 @@ def _at_centre(scene: Scene) -> dict[str, Any]:
 
 
 def _warp_samples(scene: Scene, count: int = 9) -> dict[str, Any]:
-    """The exact map on a lattice over the moving survey, absolute: moving and reference points."""
+    """Return the exact map on a lattice over the moving survey: absolute points of both."""
     west, south, east, north = scene.moving.footprint
     x, y = np.meshgrid(np.linspace(west, east, count), np.linspace(south, north, count))
     d = scene.moving.distortion

@@ -332,6 +332,38 @@ def demo(
 
 
 @app.command()
+def synth(
+    scenario: Annotated[str, typer.Argument(help="A scenario's name, or a recipe's TOML file.")],
+    out: OutOption,
+    kind: Annotated[
+        str | None,
+        typer.Option("--format", help="obj, ply, ply-cloud, laz, glb, colmap or images."),
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Another seed is another seafloor.")] = 0,
+    size: Annotated[float | None, typer.Option(help="Side of the patch in metres.")] = None,
+    changes: SetOption = None,
+    overwrite: OverwriteOption = False,
+    as_json: JsonOption = False,
+    debug: DebugOption = False,
+) -> int:
+    """Make a pair of surveys of a seafloor that is known, with the truth beside them."""
+    del debug
+    from meshreg.cli_parts import making
+    from meshreg.cli_parts.guard import run_stoppable
+
+    voice = _voice(as_json)
+    request = making.SynthRequest(
+        scenario, out, kind, seed, size, making.parse_changes(changes), overwrite
+    )
+    document = run_stoppable(lambda unfinished: making.synth(request, voice))
+    if as_json:
+        voice.document(document)
+    else:
+        making.show(document, voice)
+    return 0
+
+
+@app.command()
 def benchmark(
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for pairs, tables, page.")],
     scenarios: Annotated[

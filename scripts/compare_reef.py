@@ -10,13 +10,14 @@ from __future__ import annotations
 
 import argparse
 import sys
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-from data_synth.seafloor import SITES, make_seafloor  # noqa: E402
+from data_synth.seafloor import SITES, make_seafloor
 
 SIDE, CELL = 8.0, 0.01
 
@@ -45,7 +46,7 @@ def spectrum(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     f = np.fft.fftfreq(z.shape[0], CELL)
     radius = np.hypot(*np.meshgrid(f, f))
     edges = np.geomspace(0.2, 50.0, 25)
-    rings = [(radius >= a) & (radius < b) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+    rings = [(radius >= a) & (radius < b) for a, b in pairwise(edges)]
     return 1 / np.sqrt(edges[:-1] * edges[1:]), np.array([power[ring].mean() for ring in rings])
 
 
@@ -105,9 +106,17 @@ def main() -> None:
         axis.hist(slopes(real, times), bins, density=True, histtype="step", color="black", lw=2)
         axis.set(title=f"slope at {times} cm", xlabel="degrees", ylabel="share per degree")
         q = [5, 25, 50, 75, 90, 95]
-        print(f"slope quantiles {q} at {times} cm, real", np.percentile(slopes(real, times), q).round(1))
+        print(
+            f"slope quantiles {q} at {times} cm, real",
+            np.percentile(slopes(real, times), q).round(1),
+        )
         for z in made[:3]:
-            print("   synthetic", np.percentile(slopes(z, times), q).round(1), "sd", level(z).std().round(3))
+            print(
+                "   synthetic",
+                np.percentile(slopes(z, times), q).round(1),
+                "sd",
+                level(z).std().round(3),
+            )
     print("sd of levelled height, real", level(real).std().round(3))
     args.output.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(args.output, dpi=80)

@@ -49,7 +49,7 @@ def read_record(job: Job, folder: Path) -> Record | None:
 
 def run_job(job: Job, folder: Path) -> Record:
     """Run a job and write its record; a failure of the program itself is recorded too."""
-    started = time.perf_counter()
+    started, busy = time.perf_counter(), time.process_time()
     record: Record = {"key": key_of(job), "job": plain(job), "rows": [], "figures": []}
     try:
         record |= _RUNNERS[job.kind](job, folder)
@@ -58,6 +58,7 @@ def run_job(job: Job, folder: Path) -> Record:
         record["error"] = f"{type(error).__name__}: {error}"
         record["traceback"] = traceback.format_exc()
     record["seconds"] = time.perf_counter() - started
+    record["cpu_seconds"] = time.process_time() - busy
     record = _finite(record)
     path = record_path(job, folder)
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -240,7 +240,7 @@ def _other_jobs(options: Options, chosen: tuple[str, ...]) -> Iterator[Job]:
 
 def site_count(pairs: int) -> int:
     """Return how many places are kept so that `pairs` of different ones can be formed."""
-    return 0 if pairs == 0 else int(np.clip(math.ceil(2 * math.sqrt(pairs)), 15, MOST_SITES))
+    return 0 if pairs == 0 else int(np.clip(math.ceil(2 * math.sqrt(pairs)), 6, MOST_SITES))
 
 
 def different_places(count: int, sites: int, seed: int) -> list[tuple[int, int]]:

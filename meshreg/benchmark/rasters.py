@@ -59,7 +59,7 @@ def save_place(pairs: Pairs, key: str, path: Path) -> None:
 def place_key(path: Path) -> str:
     """Return the key under which a place was kept; empty where there is none or it is broken."""
     try:
-        with np.load(path, allow_pickle=False) as stored:
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
             return str(stored["key"])
     except (OSError, ValueError, KeyError, EOFError):
         return ""

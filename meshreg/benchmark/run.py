@@ -85,7 +85,7 @@ def run_benchmark(
         "options": dataclasses.asdict(options),
         "versions": versions(),
         "wall_seconds": time.perf_counter() - started,
-        "job_seconds": sum(record["seconds"] for record in records),
+        "cpu_seconds": sum(record["cpu_seconds"] for record in records),
         **summary,
     }
     _write(summary, rows, folder)

@@ -17,9 +17,12 @@ from numpy.typing import NDArray
 from meshreg.jit import jit, prange
 from meshreg.raster.shade_kernels import (
     BandPlace,
+    ColorArrays,
     ColorSums,
     MeshArrays,
     Pages,
+    no_sums,
+    row_means,
     shade_textures,
     shade_vertices,
 )
@@ -44,6 +47,7 @@ class Lattice(NamedTuple):
     last: int
     band_rows: int
     times: int
+    least: int  # samples of a cell that must have a color
 
 
 @jit(parallel=True, nogil=True)
@@ -209,16 +213,19 @@ def _average_heights(
 @jit(parallel=True, nogil=True)
 def render(
     mesh: MeshArrays, faces_of: BandFaces, lattice: Lattice,
-    height: Float32, samples: UInt16, pages: Pages, sums: ColorSums,
+    height: Float32, samples: UInt16, pages: Pages, sums: ColorSums, out: ColorArrays,
 ) -> None:  # fmt: skip
-    """Draw the cell rows of `lattice`: mean heights, counts of samples and sums of colors.
+    """Draw the cell rows of `lattice`: mean heights, counts of samples, and colors.
 
-    `height` and `samples` are those of the whole raster, `sums` starts at the first row. Empty
-    arrays switch a part off: `height` when the heights are known already, `pages.pixels` without
-    pages in memory, `mesh.colors` without vertex colors.
+    `height`, `samples` and `out` are those of the whole raster. Empty arrays switch a part off:
+    `height` when the heights are known already, `pages.texels` without pages in memory,
+    `mesh.colors` without vertex colors. Color sums are added to `sums`, which starts at the first
+    row; where that is empty they become means in `out` at once.
     """
     times, n_cols = lattice.times, samples.shape[1]
     n_bands = (lattice.last - lattice.first + lattice.band_rows - 1) // lattice.band_rows
+    textured, painted = pages.texels.size > 0, mesh.colors.size > 0
+    at_once = sums.totals.shape[0] == 0
     for k in prange(n_bands):
         top = lattice.first + k * lattice.band_rows
         bottom = min(top + lattice.band_rows, lattice.last)
@@ -230,8 +237,15 @@ def render(
             _draw_face(mesh.points, mesh.faces[members[m]], m, top * times, depth, owner)
         if height.size > 0:
             _average_heights(depth, owner, times, height[top:bottom], samples[top:bottom])
-        place = BandPlace(top * times, times, top - lattice.first)
-        if pages.pixels.size > 0:
-            shade_textures(mesh, members, pages, owner, place, sums)
-        if mesh.colors.size > 0:
-            shade_vertices(mesh, members, owner, place, sums)
+        if not (textured or painted):
+            continue
+        place, mine = BandPlace(top * times, times, top - lattice.first), sums
+        if at_once:
+            place, mine = BandPlace(top * times, times, 0), no_sums(bottom - top, n_cols)
+        if textured:
+            shade_textures(mesh, members, pages, owner, place, mine)
+        if painted:
+            shade_vertices(mesh, members, owner, place, mine)
+        if at_once:
+            for row in range(bottom - top):
+                row_means(mine, row, lattice.least, out, top + row)

@@ -18,7 +18,7 @@ from meshreg.types import Bool, Float64, Grid, Int32, Mesh
 
 if TYPE_CHECKING:
     from meshreg.raster.kernels import BandFaces
-    from meshreg.raster.shade_kernels import MeshArrays, Pages
+    from meshreg.raster.shade_kernels import ColorArrays, ColorSums, MeshArrays, Pages
 
 log = logging.getLogger("meshreg")
 
@@ -116,19 +116,21 @@ class _Drawing:
 
     def run(self, used: Int32, step: float, masked: dict[str, int]) -> None:
         """Draw everything; `step` [m] lies between samples."""
+        from meshreg.raster.shade_kernels import color_means, no_sums
         from meshreg.raster.textures import load_pages, plan_pages
 
         groups = plan_pages(self.mesh, used, step) if len(used) else []
-        colored = bool(groups) or self.mesh.colors is not None
         rows, cols = self.layers.height.shape
+        # With one group the kernel makes means at once; sums are needed to add up over several.
+        apart = len(groups) > 1
         per_slab = max(1, _SLAB_CELLS // (cols * self.band_rows)) * self.band_rows
         loaded, pages = -1, no_pages()
         missing: set[int] = set()
-        if colored:
+        if groups or self.mesh.colors is not None:
             self.layers.still = np.zeros((rows, cols), bool)
         for first in range(0, rows, per_slab):
             last = min(first + per_slab, rows)
-            sums = _no_sums((last - first, cols) if colored else (0, 0))
+            sums = no_sums(last - first if apart else 0, cols)
             for number in range(max(1, len(groups))):
                 if groups and number != loaded:
                     pages = no_pages()  # let go of the last group before decoding the next
@@ -136,32 +138,30 @@ class _Drawing:
                     loaded = number
                     missing.update(failed)
                 self._render(first, last, number == 0, pages, sums)
-            if colored:
-                self._average(first, last, sums)
+            if apart:
+                color_means(sums, least_samples(self.times), self._colors(), first)
         if missing:
             assert self.mesh.face_texture is not None
             gone = np.isin(self.mesh.face_texture, list(missing))
             masked["missing page"] = int(np.count_nonzero(gone))
 
-    def _render(self, first: int, last: int, is_first: bool, pages: Pages, sums: Any) -> None:
+    def _colors(self) -> ColorArrays:
+        from meshreg.raster.shade_kernels import ColorArrays
+
+        still = self.layers.still
+        if still is None:
+            still = np.empty((0, 0), bool)
+        return ColorArrays(self.layers.color, self.layers.color_valid, still)
+
+    def _render(self, first: int, last: int, is_first: bool, pages: Pages, sums: ColorSums) -> None:
         from meshreg.raster import kernels
 
         height = self.layers.height if is_first else np.empty((0, 0), np.float32)
         arrays = mesh_arrays(self.mesh, self.points, with_colors=is_first)
-        lattice = kernels.Lattice(first, last, self.band_rows, self.times)
-        kernels.render(arrays, self.faces_of, lattice, height, self.layers.samples, pages, sums)
-
-    def _average(self, first: int, last: int, sums: Any) -> None:
-        from meshreg.raster import shade_kernels
-
-        assert self.layers.still is not None
-        shade_kernels.color_means(
-            sums,
-            least_samples(self.times),
-            self.layers.color[first:last],
-            self.layers.color_valid[first:last],
-            self.layers.still[first:last],
-        )
+        least = least_samples(self.times)
+        lattice = kernels.Lattice(first, last, self.band_rows, self.times, least)
+        samples = self.layers.samples
+        kernels.render(arrays, self.faces_of, lattice, height, samples, pages, sums, self._colors())
 
 
 def least_samples(times: int) -> int:
@@ -199,12 +199,4 @@ def no_pages() -> Pages:
     """Return an empty set of pages."""
     from meshreg.raster.shade_kernels import Pages
 
-    return Pages(np.empty((0, 6)), np.empty(0, np.uint8), np.empty(0, np.uint8))
-
-
-def _no_sums(shape: tuple[int, int]) -> Any:
-    from meshreg.raster.shade_kernels import ColorSums
-
-    tallies = np.zeros((*shape, 3), np.uint16)
-    tallies[:, :, 1] = 65535
-    return ColorSums(np.zeros((*shape, 3), np.float32), tallies)
+    return Pages(np.empty((0, 6)), np.empty(0, np.uint32))

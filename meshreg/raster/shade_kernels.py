@@ -16,6 +16,9 @@ from numpy.typing import NDArray
 from meshreg.jit import jit, prange
 from meshreg.types import Bool, Float32, Float64, Int32, UInt8
 
+UInt32 = NDArray[np.uint32]
+SEEN = 0xFF000000
+
 
 class MeshArrays(NamedTuple):
     """A mesh on the fine lattice; `uv`, `face_page` and `colors` may be empty."""
@@ -31,13 +34,12 @@ class Pages(NamedTuple):
     """Decoded texture pages, one after the other.
 
     A row of `table` is (offset in texels or -1 when not in memory, width, height, 1 to wrap,
-    texels that u = 0 to 1 spans, texels that v spans). `seen` is empty or 0 where a texel has no
-    color.
+    texels that u = 0 to 1 spans, texels that v spans). A texel is red + 256 green + 65536 blue,
+    and `SEEN` on top where it has a color.
     """
 
     table: Float64  # (P, 6)
-    pixels: UInt8  # (3 times the texels,)
-    seen: UInt8  # (texels,)
+    texels: UInt32
 
 
 class BandPlace(NamedTuple):
@@ -53,6 +55,14 @@ class ColorSums(NamedTuple):
 
     totals: Float32  # (rows, cols, 3)
     tallies: NDArray[np.uint16]  # (rows, cols, 3)
+
+
+class ColorArrays(NamedTuple):
+    """The whole raster's colors; `still` where all samples of a cell have one and the same."""
+
+    color: UInt8  # (H, W, 3)
+    valid: Bool  # (H, W)
+    still: Bool  # (H, W)
 
 
 @jit(nogil=True)
@@ -92,43 +102,51 @@ def _texel_plane(mesh: MeshArrays, face: int, page: Float64, plane: Float64) -> 
 
 
 @jit(nogil=True, inline="always")
-def _bilinear(
-    pixels: UInt8, seen: UInt8, offset: int, size: tuple[int, int], wrap: bool, x: float, y: float
-) -> tuple[int, int, int]:
-    """Color times 65536 at (x, y) of the page that starts at texel `offset`, over its seen texels.
+def _spread(texel: int) -> int:
+    """Move the three colors of a texel 20 bits apart: room for 12 bits of weight each."""
+    return (texel & 0xFF) | ((texel & 0xFF00) << 12) | ((texel & 0xFF0000) << 24)
 
-    Red is -1 when the nearest texel is not seen. Whole numbers: their sums do not depend on order.
+
+@jit(nogil=True, inline="always")
+def _bilinear(
+    texels: UInt32, offset: int, size: tuple[int, int], wrap: bool, x: float, y: float
+) -> int:
+    """Color at (x, y) of the page that starts at texel `offset`, over the texels that are seen.
+
+    The answer is 4096 times red, green and blue, 20 bits apart: one multiplication does for all
+    three, and sums of whole numbers do not depend on order. -1 when the nearest texel is not seen.
     """
     width, height = size
     left, top = int(x), int(y)
-    fx, fy = 65536.0 * (x - left), y - top
+    fx, fy = 4096.0 * (x - left), y - top
     right, bottom = left + 1, top + 1
     if wrap:
         left, right, top, bottom = left % width, right % width, top % height, bottom % height
     else:
         right, bottom = min(right, width - 1), min(bottom, height - 1)
-    nw, ne = offset + top * width + left, offset + top * width + right
-    sw, se = offset + bottom * width + left, offset + bottom * width + right
-    w_se = int(fx * fy)
-    w_sw = int(65536.0 * fy) - w_se
-    w_ne = int(fx) - w_se
-    w_nw = 65536 - w_se - w_sw - w_ne
-    if seen.size > 0:
-        near = (sw if fx < 32768.0 else se) if fy >= 0.5 else (nw if fx < 32768.0 else ne)
-        if seen[near] == 0:
-            return -1, 0, 0
-        w_nw, w_ne, w_sw, w_se = w_nw * seen[nw], w_ne * seen[ne], w_sw * seen[sw], w_se * seen[se]
-        scale = 65536.0 / (w_nw + w_ne + w_sw + w_se)
+    top, bottom = offset + top * width, offset + bottom * width
+    nw, ne = int(texels[top + left]), int(texels[top + right])
+    sw, se = int(texels[bottom + left]), int(texels[bottom + right])
+    w_se = int(fx * fy + 0.5)
+    w_sw = int(4096.0 * fy + 0.5) - w_se
+    w_ne = int(fx + 0.5) - w_se
+    if nw & ne & sw & se < SEEN:
+        near = (sw if fx < 2048.0 else se) if fy >= 0.5 else (nw if fx < 2048.0 else ne)
+        if near < SEEN:
+            return -1
+        w_nw = (4096 - w_se - w_sw - w_ne) * (nw // SEEN)
+        w_ne, w_sw, w_se = w_ne * (ne // SEEN), w_sw * (sw // SEEN), w_se * (se // SEEN)
+        scale = 4096.0 / (w_nw + w_ne + w_sw + w_se)
         w_ne, w_sw, w_se = int(w_ne * scale), int(w_sw * scale), int(w_se * scale)
-        w_nw = 65536 - w_se - w_sw - w_ne
-    nw, ne, sw, se = 3 * nw, 3 * ne, 3 * sw, 3 * se
-    return (
-        w_nw * pixels[nw] + w_ne * pixels[ne] + w_sw * pixels[sw] + w_se * pixels[se],
-        w_nw * pixels[nw + 1] + w_ne * pixels[ne + 1]
-        + w_sw * pixels[sw + 1] + w_se * pixels[se + 1],
-        w_nw * pixels[nw + 2] + w_ne * pixels[ne + 2]
-        + w_sw * pixels[sw + 2] + w_se * pixels[se + 2],
-    )  # fmt: skip
+        if nw < SEEN:  # what rounding leaves over goes to a texel that is seen
+            rest = 4096 - w_ne - w_sw - w_se
+            w_ne, w_sw, w_se = (
+                (w_ne + rest, w_sw, w_se) if w_ne > 0
+                else (w_ne, w_sw + rest, w_se) if w_sw > 0
+                else (w_ne, w_sw, w_se + rest)
+            )  # fmt: skip
+    w_nw = 4096 - w_se - w_sw - w_ne
+    return w_nw * _spread(nw) + w_ne * _spread(ne) + w_sw * _spread(sw) + w_se * _spread(se)
 
 
 @jit(nogil=True)
@@ -178,15 +196,16 @@ def shade_textures(
                     continue
                 u = min(max(u0 + u_col * j + u_row * y, u_low), u_high)
                 v = min(max(v0 + v_col * j + v_row * y, v_low), v_high)
-                r, g, b = _bilinear(pages.pixels, pages.seen, offset, (width, height), wrap, u, v)
-                if r >= 0:
+                rgb = _bilinear(pages.texels, offset, (width, height), wrap, u, v)
+                if rgb >= 0:
+                    r, g, b = rgb & 0xFFFFF, (rgb >> 20) & 0xFFFFF, rgb >> 40
                     red, green, blue = red + r, green + g, blue + b
-                    grey = (r + g + b + 32768) >> 16
+                    grey = (r + g + b + 2048) >> 12
                     count, low, high = count + 1, min(low, grey), max(high, grey)
             if count > 0:
-                totals[row, col, 0] += red / 65536
-                totals[row, col, 1] += green / 65536
-                totals[row, col, 2] += blue / 65536
+                totals[row, col, 0] += red / 4096
+                totals[row, col, 1] += green / 4096
+                totals[row, col, 2] += blue / 4096
                 tallies[row, col, 0] += count
                 tallies[row, col, 1] = min(tallies[row, col, 1], low)
                 tallies[row, col, 2] = max(tallies[row, col, 2], high)
@@ -230,20 +249,31 @@ def shade_vertices(
             tallies[row, col, 2] = max(tallies[row, col, 2], grey)
 
 
-@jit(parallel=True, nogil=True)
-def color_means(sums: ColorSums, least: int, color: UInt8, valid: Bool, still: Bool) -> None:
-    """Turn color sums into means where at least `least` samples were seen.
+@jit(nogil=True)
+def no_sums(rows: int, cols: int) -> ColorSums:
+    """Return sums of nothing."""
+    tallies = np.zeros((rows, cols, 3), np.uint16)
+    tallies[:, :, 1] = 65535
+    return ColorSums(np.zeros((rows, cols, 3), np.float32), tallies)
 
-    `still` is set where all samples of a cell have one and the same color.
-    """
-    for row in prange(color.shape[0]):
-        for col in range(color.shape[1]):
-            count = sums.tallies[row, col, 0]
-            if count >= least:
-                valid[row, col] = True
-                still[row, col] = sums.tallies[row, col, 1] == sums.tallies[row, col, 2]
-                for k in range(3):
-                    color[row, col, k] = int(sums.totals[row, col, k] / count + 0.5)
+
+@jit(nogil=True)
+def row_means(sums: ColorSums, row: int, least: int, out: ColorArrays, out_row: int) -> None:
+    """Turn a row of color sums into means where at least `least` samples were seen."""
+    for col in range(out.color.shape[1]):
+        count = sums.tallies[row, col, 0]
+        if count >= least:
+            out.valid[out_row, col] = True
+            out.still[out_row, col] = sums.tallies[row, col, 1] == sums.tallies[row, col, 2]
+            for k in range(3):
+                out.color[out_row, col, k] = int(sums.totals[row, col, k] / count + 0.5)
+
+
+@jit(parallel=True, nogil=True)
+def color_means(sums: ColorSums, least: int, out: ColorArrays, first: int) -> None:
+    """Turn color sums, whose first row is the raster's row `first`, into means."""
+    for row in prange(sums.totals.shape[0]):
+        row_means(sums, row, least, out, first + row)
 
 
 @jit(nogil=True)
@@ -312,30 +342,42 @@ def _span_in_row(x: Float64, y: Float64, row: float) -> tuple[float, float]:
 
 
 @jit(parallel=True, nogil=True)
-def shrunk(image: UInt8, used: UInt8, seen: UInt8, times: int) -> tuple[UInt8, UInt8]:
-    """Average `times` × `times` texels over those that are seen.
+def packed(image: UInt8, out: UInt32) -> None:
+    """Write a page (h, w, 3 or 4) as texels; those with alpha under 128 are not seen."""
+    height, width, channels = image.shape
+    for row in prange(height):
+        for col in range(width):
+            texel = image[row, col, 0] | image[row, col, 1] << 8 | image[row, col, 2] << 16
+            if channels == 3 or image[row, col, 3] >= 128:
+                texel |= SEEN
+            out[row * width + col] = texel
 
-    The second result is 1 where at least half of the block's used texels are seen.
+
+@jit(parallel=True, nogil=True)
+def shrunk(image: UInt8, used: UInt8, times: int, out: UInt32) -> None:
+    """Write the means of blocks of `times` × `times` texels over those that are used and seen.
+
+    A block is seen where at least half of its used texels are.
     """
-    height, width = seen.shape
+    height, width, channels = image.shape
     rows, cols = (height + times - 1) // times, (width + times - 1) // times
-    out = np.zeros((rows, cols, 3), np.uint8)
-    out_seen = np.zeros((rows, cols), np.uint8)
     for row in prange(rows):
         for col in range(cols):
             red, green, blue, count, mine = 0, 0, 0, 0, 0
             for i in range(row * times, min((row + 1) * times, height)):
                 for j in range(col * times, min((col + 1) * times, width)):
                     mine += used[i, j]
-                    if seen[i, j]:
+                    if used[i, j] and (channels == 3 or image[i, j, 3] >= 128):
                         red += image[i, j, 0]
                         green += image[i, j, 1]
                         blue += image[i, j, 2]
                         count += 1
+            out[row * cols + col] = 0
             if count > 0 and 2 * count >= mine:
                 half = count // 2
-                out[row, col, 0] = (red + half) // count
-                out[row, col, 1] = (green + half) // count
-                out[row, col, 2] = (blue + half) // count
-                out_seen[row, col] = 1
-    return out, out_seen
+                red, green, blue = (
+                    (red + half) // count,
+                    (green + half) // count,
+                    (blue + half) // count,
+                )
+                out[row * cols + col] = red | green << 8 | blue << 16 | SEEN

@@ -58,7 +58,7 @@ def plan_pages(mesh: Mesh, used: Int32, sample: float) -> list[list[PagePlan]]:
         while wraps and any(length % times for length in texture.size):
             times -= 1  # blocks must fit the period
         plan = PagePlan(int(index), texture, times, wraps)
-        need = 3 * plan.stored[0] * plan.stored[1]
+        need = 4 * plan.stored[0] * plan.stored[1]
         if not groups or need > free:
             groups.append([])
             free = _GROUP_BYTES
@@ -69,36 +69,32 @@ def plan_pages(mesh: Mesh, used: Int32, sample: float) -> list[list[PagePlan]]:
 
 def load_pages(mesh: Mesh, group: list[PagePlan]) -> tuple[Pages, list[int]]:
     """Decode a group of pages; also return the pages that could not be, which stay uncolored."""
-    from meshreg.raster.shade_kernels import Pages
+    from meshreg.raster.shade_kernels import Pages, packed, shrunk
 
-    sizes = [plan.stored[0] * plan.stored[1] for plan in group]
     table = np.full((len(mesh.textures), 6), -1.0)
-    pixels = np.empty(3 * sum(sizes), np.uint8)
-    seen = np.empty(0, np.uint8)
+    sizes = [plan.stored[0] * plan.stored[1] for plan in group]
+    texels = np.empty(sum(sizes), np.uint32)
     missing, offset = [], 0
     for plan, size in zip(group, sizes, strict=True):
         try:
-            image, alpha = _decoded(plan.texture)
+            image = _decoded(plan.texture)
         except InputError as error:
             log.warning("Texture page %s is left out: %s", plan.texture.name, error)
             missing.append(plan.index)
             continue
-        if plan.times > 1:
-            image, alpha = _averaged(mesh, plan, image, alpha)
-        pixels[3 * offset : 3 * (offset + size)] = image.ravel()
-        if alpha is not None:
-            if not seen.size:
-                seen = np.ones(sum(sizes), np.uint8)
-            seen[offset : offset + size] = alpha.ravel()
+        if plan.times == 1:
+            packed(image, texels[offset : offset + size])
+        else:
+            shrunk(image, _used(mesh, plan), plan.times, texels[offset : offset + size])
         width, height = plan.texture.size
         scale = width / plan.times, height / plan.times
         table[plan.index] = (offset, *plan.stored, plan.wraps, *scale)
         offset += size
-    return Pages(table, pixels, seen), missing
+    return Pages(table, texels), missing
 
 
-def _decoded(texture: Texture) -> tuple[UInt8, UInt8 | None]:
-    """Load a page: its colors, and 1 where alpha is 128 or more (None without alpha)."""
+def _decoded(texture: Texture) -> UInt8:
+    """Load a page; check it against its header."""
     image = texture.load()
     width, height = texture.size
     if image.dtype != np.uint8 or image.shape not in ((height, width, 3), (height, width, 4)):
@@ -108,26 +104,24 @@ def _decoded(texture: Texture) -> tuple[UInt8, UInt8 | None]:
             file=texture.name,
             remedy="Export the texture again.",
         )
-    if image.shape[2] == 3:
-        return image, None
-    return np.ascontiguousarray(image[:, :, :3]), (image[:, :, 3] >= 128).astype(np.uint8)
+    image = np.ascontiguousarray(image).view()
+    image.flags.writeable = False  # one type for the kernels, whoever decoded it
+    return image
 
 
-def _averaged(mesh: Mesh, plan: PagePlan, image: UInt8, alpha: UInt8 | None) -> tuple[UInt8, UInt8]:
-    """Average blocks of texels, over those that the mesh uses.
+def _used(mesh: Mesh, plan: PagePlan) -> UInt8:
+    """Say which texels of a page the mesh uses, (height, width); all, where the page wraps.
 
-    Without that a block at the edge of an atlas chart would take in the filling beside it.
+    Averaged over any others, a block at the edge of a chart would take in the filling beside it.
     """
     import numba
 
-    from meshreg.raster.shade_kernels import covered, shrunk
+    from meshreg.raster.shade_kernels import covered
 
     assert mesh.uv is not None
     assert mesh.face_texture is not None
+    width, height = plan.texture.size
     if plan.wraps:
-        used = np.ones(image.shape[:2], np.uint8)
-    else:
-        workers = numba.get_num_threads()
-        used = covered(mesh.uv, mesh.face_texture, plan.index, image.shape[:2], workers)
-    seen = used if alpha is None else used * alpha
-    return shrunk(np.ascontiguousarray(image), used, seen, plan.times)
+        return np.ones((height, width), np.uint8)
+    workers = numba.get_num_threads()
+    return covered(mesh.uv, mesh.face_texture, plan.index, (height, width), workers)
