@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from data_synth import types as t
 from data_synth.colonies import candidates, make_features, set_reach, uniform
 from data_synth.seafloor import Seafloor, Site
+from meshreg.errors import UsageError
 
 Rows = NDArray[np.void]
 Mask = NDArray[np.bool_]
@@ -45,9 +46,11 @@ class Change:
     kelp: float = 0.0
     mobile: float = 0.0
 
-    def scaled(self, factor: float) -> Change:
-        """Return every strength times `factor`."""
-        return Change(**{f.name: getattr(self, f.name) * factor for f in fields(self)})
+    def __post_init__(self) -> None:
+        for item in fields(self):
+            value = getattr(self, item.name)
+            if not 0.0 <= value <= 1.0:
+                raise UsageError(f"change.{item.name} is {value}; it must be 0 to 1.")
 
 
 # metres a year in radius and height (order of magnitude: tables of coral growth rates)

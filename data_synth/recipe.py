@@ -181,7 +181,7 @@ def _fitted(now: Any, value: Any, drawn: bool, key: str, path: Path) -> Any:
     """Return `value` in the type of `now` (a range too where `drawn`), or say what was expected."""
     number = isinstance(value, int | float) and not isinstance(value, bool)
     numbers = isinstance(value, list | tuple) and all(isinstance(v, int | float) for v in value)
-    if isinstance(now, bool) or isinstance(now, str):
+    if isinstance(now, bool | str):
         if type(value) is type(now):
             return value
     elif isinstance(now, int):

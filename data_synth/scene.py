@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -241,6 +241,8 @@ def make_scene(recipe: Recipe, seed: int = 0, size: float | None = None) -> Scen
     after, events = apply_change(
         ground, recipe.site, world_seed + 77 * place.other_ground, recipe.change
     )
+    if place.other_ground:
+        distortion = _same_depth(distortion, before, after, half)
     reference = Take(
         "reference", before, recipe.reference, plans[0], recipe.sfm, identity(centre),
         (-half, -half, half, half), seeds[0],
@@ -250,6 +252,14 @@ def make_scene(recipe: Recipe, seed: int = 0, size: float | None = None) -> Scen
         (shift[0] - half, shift[1] - half, shift[0] + half, shift[1] + half), seeds[1],
     )  # fmt: skip
     return Scene(recipe, seed, size, reference, moving, events)
+
+
+def _same_depth(distortion: Distortion, one: Seafloor, other: Seafloor, half: float) -> Distortion:
+    """Lift the second survey so that its mean depth is the first one's."""
+    side = np.linspace(-half, half, 100)
+    x, y = np.meshgrid(side, side)
+    rise = float(one.height(x, y, 0.1).mean() - other.height(x, y, 0.1).mean())
+    return replace(distortion, start=distortion.start + np.array([0.0, 0.0, rise]))
 
 
 def _footprint_shift(

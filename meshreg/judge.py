@@ -318,7 +318,7 @@ def _verdict(
         return say(
             "review", f"the channels contradict each other: {where} fits elsewhere ({words})"
         )
-    if alarm > settings.max_false_alarm and max(best.gaps.values()) < settings.support_gap:
+    if alarm > settings.chance_false_alarm:
         return say(
             "rejected",
             f"no offset within ±{radius:g} m stands out from chance ({words}); "

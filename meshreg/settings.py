@@ -85,7 +85,8 @@ class JudgeSettings:
     support_gap: float = 1.5  # a channel that puts a place first by this much supports it
     accept_gap: float = 4.0
     overwhelming_gap: float = 8.0
-    max_false_alarm: float = 1e-6
+    max_false_alarm: float = 1e-6  # more is not accepted
+    chance_false_alarm: float = 1e-4  # more is chance: rejected
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """Rasterizing: a textured mesh against Open3D's rays with a NumPy texture look-up, and clouds.
 
 Both sides get the same mesh and texture in memory and answer on the same grid: the peer with one
-ray and the nearest texel a cell, meshreg with the mean of its samples. For the heights' comparison
+ray and one bilinear look-up a cell, meshreg with the mean of four or more. For the heights' comparison
 meshreg takes one sample at the cell's centre too.
 """
 
@@ -69,15 +69,24 @@ def by_open3d(mesh: Mesh, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
     corners = mesh.uv[face]
     weights = np.column_stack([1 - weights.sum(axis=1), weights])
     u, v = np.einsum("nk,nkc->cn", weights, corners)
-    image = mesh.textures[0].load()
-    size = image.shape[0]
-    row = np.clip(((1 - v) * size).astype(int), 0, size - 1)
-    col = np.clip((u * size).astype(int), 0, size - 1)
     height = np.full(east.size, np.nan, np.float32)
     color = np.zeros((east.size, 3), np.uint8)
     height[hit] = top - distance[hit]
-    color[hit] = image[row, col]
+    color[hit] = looked_up(mesh.textures[0].load(), u, v)
     return height.reshape(grid.shape), color.reshape(*grid.shape, 3)
+
+
+def looked_up(image: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Bilinear colors of a square page, as meshreg samples it."""
+    size = image.shape[0]
+    x = np.clip(u * size - 0.5, 0, size - 1).astype(np.float32)
+    y = np.clip((1 - v) * size - 0.5, 0, size - 1).astype(np.float32)
+    left, top = x.astype(np.int32), y.astype(np.int32)
+    right, bottom = np.minimum(left + 1, size - 1), np.minimum(top + 1, size - 1)
+    fx, fy = (x - left)[:, None], (y - top)[:, None]
+    upper = image[top, left] * (1 - fx) + image[top, right] * fx
+    lower = image[bottom, left] * (1 - fx) + image[bottom, right] * fx
+    return (upper * (1 - fy) + lower * fy + 0.5).astype(np.uint8)
 
 
 def row(work: str, tool: str, call: Callable[[], Any], times: int = 3) -> tuple[dict, Any]:
