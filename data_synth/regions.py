@@ -98,7 +98,10 @@ def _sand(scene: Scene, step: float) -> list[list[list[float]]]:
 
     from data_synth.seafloor_kernels import evaluate_ground
 
-    west, south, east, north = scene.reference.footprint
+    west, south, east, north = (
+        edge + way * 5 * step
+        for edge, way in zip(scene.reference.footprint, (-1, -1, 1, 1), strict=True)
+    )
     x, y = np.meshgrid(np.arange(west, east, step), np.arange(south, north, step))
     sandy = np.zeros(x.shape, bool)
     for take in (scene.reference, scene.moving):

@@ -38,7 +38,8 @@ def choose_cells(
     The DEM's cell is the paper's 0.10 m, but not finer than the points (three times the spacing
     of a cloud's points, so that the orthomosaic's cells of half the size hold two points each) or
     the texels; and finer where the patch is under 5 m across (50 cells at least) or its points are
-    under 2 mm apart. It has one digit. The orthomosaic has half that cell.
+    under 2 mm apart. It has one digit. The orthomosaic has half that cell,
+    or the same where the texels are no finer.
     SIFT works at the coarser texture's spacing, not finer than 0.01 m and not coarser than the
     orthomosaic, and coarsens where its raster would have over a quarter of `settings.max_cells`.
 
@@ -57,7 +58,9 @@ def choose_cells(
     pair = [(survey, measure_spacing(survey)) for survey in (reference, moving)]
     notes: list[str] = []
     dem = _default_dem_cell(pair, notes if settings.dem_cell is None else [])
-    ortho = 0.5 * dem
+    texels = max(spacing.texels or spacing.points for _, spacing in pair)
+    # half a texel would only show how texels are read between their centres
+    ortho = dem if texels > 0.75 * dem else 0.5 * dem
     if settings.ortho_cell is not None:
         ortho = settings.ortho_cell
         dem = ortho * max(1, math.ceil(dem / ortho - 1e-6))

@@ -41,7 +41,7 @@ def plan_pages(mesh: Mesh, used: Int32, sample: float) -> list[list[PagePlan]]:
     A page whose texels are finer than the distance `sample` [m] between samples is averaged over
     blocks of texels as wide as that; else bilinear samples would skip texels, and alias.
     """
-    from meshreg.raster.shade_kernels import page_spans
+    from meshreg.raster.page_kernels import page_spans
 
     assert mesh.uv is not None
     assert mesh.face_texture is not None
@@ -69,7 +69,8 @@ def plan_pages(mesh: Mesh, used: Int32, sample: float) -> list[list[PagePlan]]:
 
 def load_pages(mesh: Mesh, group: list[PagePlan]) -> tuple[Pages, list[int]]:
     """Decode a group of pages; also return the pages that could not be, which stay uncolored."""
-    from meshreg.raster.shade_kernels import Pages, packed, shrunk
+    from meshreg.raster.page_kernels import packed, shrunk
+    from meshreg.raster.shade_kernels import Pages
 
     table = np.full((len(mesh.textures), 6), -1.0)
     sizes = [plan.stored[0] * plan.stored[1] for plan in group]
@@ -116,7 +117,7 @@ def _used(mesh: Mesh, plan: PagePlan) -> UInt8:
     """
     import numba
 
-    from meshreg.raster.shade_kernels import covered
+    from meshreg.raster.page_kernels import covered
 
     assert mesh.uv is not None
     assert mesh.face_texture is not None

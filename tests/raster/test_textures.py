@@ -169,6 +169,29 @@ def test_each_face_takes_its_own_page(monkeypatch, group_bytes):
         assert np.abs(part - truth).max() <= 0.51
 
 
+def test_slabs_and_groups_of_pages_change_nothing(monkeypatch):
+    from meshreg.raster import mesh as module
+
+    survey = two_page_mesh(page(noise(30, 30, 1)), page(noise(30, 30, 2, channels=4)))
+    colors = np.random.default_rng(0).integers(0, 256, (6, 3))
+    on = survey.geometry.face_texture.copy()
+    on[0] = -1
+    mesh = dataclasses.replace(survey.geometry, colors=colors, face_texture=on)
+    survey = dataclasses.replace(survey, geometry=mesh)
+    grid = Grid(-0.01, 1.02, 0.03, (35, 70))
+    one = rasterize(survey, grid)
+    monkeypatch.setattr(textures, "_GROUP_BYTES", 1)
+    two = rasterize(survey, grid)
+    monkeypatch.setattr(module, "_SLAB_CELLS", 10 * 70)
+    three = rasterize(survey, grid)
+    for other in (two, three):
+        np.testing.assert_array_equal(other.height, one.height)
+        np.testing.assert_array_equal(other.samples, one.samples)
+        np.testing.assert_array_equal(other.color_valid, one.color_valid)
+        np.testing.assert_array_equal(other.color, one.color)
+    assert 0.2 < one.color_valid.sum() / one.valid.sum() < 0.98
+
+
 def test_pages_are_decoded_one_by_one_and_once():
     calls = []
 
