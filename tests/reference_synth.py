@@ -84,8 +84,10 @@ def bend(q, truth_warp) -> np.ndarray:
     poly, waves = np.array(truth_warp["poly"]), np.array(truth_warp["waves"])
     d = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1) @ poly.T
     phase = q[:, :2] @ waves.T
-    return d + np.cos(phase) @ np.array(truth_warp["cosines"]) + np.sin(phase) @ np.array(
-        truth_warp["sines"]
+    return (
+        d
+        + np.cos(phase) @ np.array(truth_warp["cosines"])
+        + np.sin(phase) @ np.array(truth_warp["sines"])
     )
 
 
@@ -103,5 +105,3 @@ def nearest_surface(z, step, west, north, centre, ray, fine=20_000):
     inside = (row >= 0) & (col >= 0) & (row < z.shape[0]) & (col < z.shape[1])
     met = np.flatnonzero(inside & (h <= z[row * inside, col * inside]))
     return None if len(met) == 0 else (x[met[0]], y[met[0]])
-
-

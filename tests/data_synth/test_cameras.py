@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from data_synth import cameras as cams
-from data_synth.camera_kernels import march, photograph, visible
+from data_synth.camera_kernels import ceilings, march, photograph, visible
 from data_synth.make import write_pair
 from data_synth.recipe import load
 from data_synth.scene import make_scene
@@ -29,17 +29,19 @@ def test_march_meets_what_the_slow_twin_meets():
     step = 0.02
     z = rng.normal(size=(20, 20)).repeat(8, 0).repeat(8, 1).astype(np.float32) * 0.15
     west, north = 0.0, (z.shape[0] - 1) * step
-    found = 0
+    high = ceilings(z)
+    misses = []
     for _ in range(200):
         centre = (rng.uniform(0.5, 2.5), rng.uniform(0.5, 2.5), 2.5)
         ray = (rng.uniform(-0.5, 0.5), rng.uniform(-0.5, 0.5), -1.0)
-        row, col, met = march(z, step, west, north, centre, ray, float(z.max()))
+        row, col, met = march(z, high, step, west, north, centre, ray)
         want = slow.nearest_surface(z, step, west, north, centre, ray)
         if not met or want is None:
             continue
-        found += 1
-        assert np.hypot(west + col * step - want[0], north - row * step - want[1]) < 1.5 * step
-    assert found > 100
+        misses.append(np.hypot(west + col * step - want[0], north - row * step - want[1]))
+    assert len(misses) > 100
+    assert np.median(misses) < 0.25 * step
+    assert np.quantile(misses, 0.9) < 1.5 * step  # a corner may be cut by less than a sample
 
 
 def test_pixels_are_where_a_pinhole_puts_them(take):
@@ -71,7 +73,7 @@ def test_a_wall_hides_what_is_behind():
     z[:, 100:104] = 1.0
     points = np.array([[0.5, 1.0, 0.0], [1.2, 1.0, 0.0], [1.95, 1.0, 0.0]])
     seen = visible(points, z, 0.01, 0.0, 1.99, np.array([0.2, 1.0, 2.0]))
-    assert seen.tolist() == [True, False, False]
+    assert seen.tolist() == [True, False, True]  # the last one over the wall's top
 
 
 def test_navigation_is_off_by_its_noise_and_the_offset(take):
@@ -134,7 +136,8 @@ def test_colmap_model_reads_back_in_place(tmp_path):
 
 def test_colmap_points_project_to_their_features(tmp_path):
     pycolmap = pytest.importorskip("pycolmap")
-    write_pair(recipe(), tmp_path / "pair", 4, 3.0, "colmap")
+    still = {"sfm.warp": 0.0, "sfm.warp_up": 0.0, "sfm.doming": 0.0, "sfm.scale_drift": 0.0}
+    write_pair(recipe(**still), tmp_path / "pair", 4, 3.0, "colmap")
     model = pycolmap.Reconstruction(str(tmp_path / "pair" / "moving"))
     errors = []
     for image in model.images.values():
@@ -146,6 +149,5 @@ def test_colmap_points_project_to_their_features(tmp_path):
                 uv = cams.FOCAL * local[:2] / local[2] + [cams.WIDTH / 2, cams.HEIGHT / 2]
                 errors.append(np.hypot(*(uv - point.xy)))
     assert len(errors) > 3000
-    # noise of features and of points, and the warp that the cameras do not share
-    assert np.median(errors) < 6.0
+    assert 0.3 < np.median(errors) < 2.0  # 0.4 px noise of features, 4 mm of points
     assert all(len(p.track.elements) >= 3 for p in model.points3D.values())

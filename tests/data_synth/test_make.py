@@ -70,7 +70,7 @@ def test_lies_where_the_truth_says(written):
         miss = world[:, 2] - height
         # below are undersides and the ground beneath plates; steep walls are smoothed
         assert abs(np.median(miss)) < 0.004
-        assert np.median(np.abs(miss)) < 0.012
+        assert np.median(np.abs(miss)) < 0.02
         assert np.percentile(np.abs(miss), 75) < 0.05
 
 

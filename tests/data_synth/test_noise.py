@@ -53,9 +53,7 @@ def test_vector_loops_equal_single_points():
     up, own = np.empty(500), np.empty(500)
     lumps_into(x, y, 0.5, 0.3, 7, 0.8, up, own)
     c, s = np.cos(0.3) / 0.5, np.sin(0.3) / 0.5
-    pairs = [
-        lumps_at(c * a - s * b, s * a + c * b, 7, 0.8) for a, b in zip(x, y, strict=True)
-    ]
+    pairs = [lumps_at(c * a - s * b, s * a + c * b, 7, 0.8) for a, b in zip(x, y, strict=True)]
     np.testing.assert_allclose(np.stack([up, own], axis=1), pairs, atol=1e-12)
 
 

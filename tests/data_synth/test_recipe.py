@@ -118,7 +118,8 @@ def test_elsewhere_shares_footprint_depth_and_coordinates():
         scene = make_scene(load("elsewhere"), seed, 10.0)
         one, other = scene.reference, scene.moving
         boxes = [
-            np.array(take.footprint) + np.tile(take.distortion.start[:2], 2) for take in (one, other)
+            np.array(take.footprint) + np.tile(take.distortion.start[:2], 2)
+            for take in (one, other)
         ]
         np.testing.assert_allclose(boxes[0], boxes[1], atol=1e-9)
         side = np.linspace(-4.5, 4.5, 150)

@@ -106,9 +106,7 @@ def density(z: np.ndarray, step: float, wavelengths: tuple[float, ...]) -> list[
     power = np.abs(np.fft.fft2((z - z.mean()) * window)) ** 2 * step**2 / (window**2).sum()
     f = np.fft.fftfreq(z.shape[0], step)
     radius = np.hypot(*np.meshgrid(f, f))
-    return [
-        float(power[(radius * w > 0.85) & (radius * w < 1.18)].mean()) for w in wavelengths
-    ]
+    return [float(power[(radius * w > 0.85) & (radius * w < 1.18)].mean()) for w in wavelengths]
 
 
 def test_features_never_reach_further_than_they_say(reef):
@@ -117,7 +115,8 @@ def test_features_never_reach_further_than_they_say(reef):
     x, y = rng.uniform(-2.9, 2.9, (2, 60_000))
     whole = reef.evaluate(x, y)
     chosen = [
-        np.flatnonzero(reef.features["kind"] == kind)[:1] for kind in np.unique(reef.features["kind"])
+        np.flatnonzero(reef.features["kind"] == kind)[:1]
+        for kind in np.unique(reef.features["kind"])
     ]
     for k in np.concatenate(chosen):
         f = reef.features[k]
@@ -139,7 +138,9 @@ def test_ripples_run_with_their_wavelength():
     site = SITES["sand"]
     from dataclasses import replace
 
-    site = replace(site, ripple=0.05, ripple_wavelength=0.5, ripple_wander=0.0, sand_relief=0.0, urchin=0.0)
+    site = replace(
+        site, ripple=0.05, ripple_wavelength=0.5, ripple_wander=0.0, sand_relief=0.0, urchin=0.0
+    )
     floor = make_seafloor(site, 1, (-6.0, -6.0, 6.0, 6.0))
     turn = floor.ground.ripple_turn
     along = np.arange(0, 5.0, 0.005)

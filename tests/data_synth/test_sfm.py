@@ -118,7 +118,9 @@ def test_scale_drift_changes_the_scale_across_the_patch_and_keeps_angles():
     scales = []
     for spot in points(count=200):
         east, north = (
-            (d.reference_from_moving((spot + s)[None]) - d.reference_from_moving((spot - s)[None]))[0]
+            (d.reference_from_moving((spot + s)[None]) - d.reference_from_moving((spot - s)[None]))[
+                0
+            ]
             / (2 * h)
             for s in h * np.eye(3)[:2]
         )
