@@ -16,7 +16,7 @@ BLOCK = 16  # samples
 
 @jit(nogil=True, error_model="numpy")
 def ceilings(z):
-    """Highest sample of each block of 16 x 16 and its eight neighbours: no ray above meets these."""
+    """Return the highest sample of each block of 16 x 16 and its eight neighbours."""
     rows, cols = z.shape
     tall, wide = (rows + BLOCK - 1) // BLOCK, (cols + BLOCK - 1) // BLOCK
     own = np.full((tall, wide), -np.inf, np.float32)
@@ -63,7 +63,7 @@ def march(z, high, step, west, north, centre, ray):
             return row, col, True
         low = t
         gap = h - high[i // BLOCK, j // BLOCK]
-        t += max(stride, min(BLOCK * step / flat, -gap / ray[2]))
+        t += max(stride, min(BLOCK * step / flat, -gap / ray[2]) - stride)
     return 0.0, 0.0, False
 
 
