@@ -249,31 +249,30 @@ def _fused(
     maps: Mapping[str, ChannelMap],
     answers: Mapping[tuple[float, float], Float64 | None],
 ) -> Hypothesis:
-    """Join the members of a group by their inverse covariances.
+    """Join the members of a group, each by the inverse of its variance.
 
-    A member further from the group's leading one than three of its own sigmas is named as a
-    supporter but does not pull the mean. The sum of weights is not trusted as a covariance:
-    the members look at the same ground, so the best single one's covariance is kept.
+    One number a member, not its whole covariance: two long, slanted ellipses (a beach, a ridge)
+    cross far outside both of their centres, and the joined offset must lie among its members.
+    One further from the most certain member than three of its own sigmas is named as a supporter
+    but does not pull the mean. The sum of weights is not trusted as a covariance: the members look at the
+    same ground, so the best single one's is kept.
     """
-    weights, total, best = np.zeros((2, 2)), np.zeros(2), None
-    for member in group:
-        sigma = answers[member.east, member.north]
-        if sigma is None:
-            continue
-        place = np.array([member.east, member.north])
-        step = place - (group[0].east, group[0].north)
-        if step @ np.linalg.solve(sigma + np.eye(2) * 0.02**2, step) > 3**2:
-            continue
-        weight = np.linalg.inv(sigma)
-        weights, total = weights + weight, total + weight @ place
-        best = sigma if best is None or np.trace(sigma) < np.trace(best) else best
     lead = group[0]
     place = np.array([lead.east, lead.north])
-    if best is not None:
-        place = np.linalg.solve(weights, total)
-    else:
-        cell = max(channel.window.cell for channel in maps.values())
-        best = cell**2 * np.eye(2)
+    best = max(channel.window.cell for channel in maps.values()) ** 2 * np.eye(2)
+    known = [(np.array([m.east, m.north]), answers[m.east, m.north]) for m in group]
+    told = sorted(
+        ((at, sigma) for at, sigma in known if sigma is not None), key=lambda a: np.trace(a[1])
+    )
+    if told:
+        anchor, best = told[0]
+        total, weights = np.zeros(2), 0.0
+        for at, sigma in told:
+            step = at - anchor
+            if step @ np.linalg.solve(sigma + np.eye(2) * 0.02**2, step) <= 3**2:
+                weight = 1.0 / float(np.trace(sigma))
+                total, weights = total + weight * at, weights + weight
+        place = total / weights
     methods = tuple(dict.fromkeys(m for member in group for m in member.methods))
     return Hypothesis(
         float(place[0]), float(place[1]), best, lead.gaps, lead.values, methods, lead.overlap

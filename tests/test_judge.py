@@ -138,3 +138,18 @@ def test_null_gaps_are_exponential_in_their_scale():
         ratios.append(found.peak.gap / found.null_gap)
     assert 0.3 < np.mean(ratios) < 1.8
     assert max(ratios) < 6
+
+
+def test_the_joined_offset_lies_among_its_members():
+    """Two long, slanted ellipses cross far outside both centres; their mean must not go there."""
+    rasters = pair(2, 0.2)
+    slanted = np.array([[0.0601, 0.06], [0.06, 0.0601]])
+    across = np.array([[0.0601, -0.06], [-0.06, 0.0601]])
+    told = [
+        OffsetEstimate("sift", "ok", "", OFFSET[0] + 0.05, OFFSET[1], slanted, 1.0, 9.0),
+        OffsetEstimate("terrain", "ok", "", OFFSET[0] - 0.05, OFFSET[1], across, 1.0, 9.0),
+    ]
+    judged = judge(told, rasters, SETTINGS, 5.0)
+    assert {"sift", "terrain"} <= set(judged.best.methods)
+    assert abs(judged.best.east - OFFSET[0]) < 0.06
+    assert abs(judged.best.north - OFFSET[1]) < 0.06

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import reference_synth as slow
 
 from data_synth import cameras as cams
 from data_synth.camera_kernels import ceilings, march, photograph, visible
@@ -12,7 +13,6 @@ from data_synth.recipe import load
 from data_synth.scene import make_scene
 from meshreg.io import read_survey
 from meshreg.io.options import ReadOptions
-from tests import reference_synth as slow
 
 
 def recipe(**changes: object):

@@ -8,13 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import reference_synth as slow
 
 from data_synth.make import FORMATS, make_pair, make_rasters, write_pair
 from data_synth.recipe import load
 from meshreg.errors import UsageError
 from meshreg.io import read_survey
 from meshreg.types import Mesh, PointCloud
-from tests import reference_synth as slow
 
 SMALL = {
     "output.texture": 0.02,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import reference_synth as slow
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -15,7 +16,6 @@ from data_synth.noise_kernels import (
     octaves_into,
 )
 from data_synth.sfm_kernels import bend_many
-from tests import reference_synth as slow
 
 coordinate = st.floats(-5e3, 5e3, allow_nan=False)
 seeds = st.integers(0, 2**30)

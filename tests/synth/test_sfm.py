@@ -6,12 +6,12 @@ import math
 
 import numpy as np
 import pytest
+import reference_synth as slow
 
 from data_synth.recipe import load
 from data_synth.scene import make_scene
 from data_synth.sfm import Distortion, Sfm, identity, make_distortion
 from data_synth.truth import best_fit, common_points, make_truth
-from tests import reference_synth as slow
 
 CENTRE = np.array([431_200.0, 8_376_500.0, -12.0])
 STILL = Sfm(
