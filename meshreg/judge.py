@@ -254,8 +254,8 @@ def _fused(
     One number a member, not its whole covariance: two long, slanted ellipses (a beach, a ridge)
     cross far outside both of their centres, and the joined offset must lie among its members.
     One further from the most certain member than three of its own sigmas is named as a supporter
-    but does not pull the mean. The sum of weights is not trusted as a covariance: the members look at the
-    same ground, so the best single one's is kept.
+    but does not pull the mean. The sum of weights is not trusted as a covariance: the members look
+    at the same ground, so the best single one's is kept.
     """
     lead = group[0]
     place = np.array([lead.east, lead.north])
