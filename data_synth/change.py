@@ -29,7 +29,8 @@ class Change:
     `bleaching`, `mortality`, `partial_mortality`, `breakage`, `boulders`, `mobile` are shares of
     what could change; `growth` 1 is two years; `recruits` the share of new colonies; `turf` and
     `sediment` about the share of the ground that is newly covered; `ripples` and `kelp` how far
-    from where they were; `texture` the part of the fine texture that is new.
+    from where they were; `texture` the part of the fine texture that is new. `sediment` also
+    raises or lowers the sand there is.
     """
 
     growth: float = 0.0
@@ -154,8 +155,10 @@ def _move(
 
 
 def _new_ground(ground: t.Ground, seed: int, change: Change) -> t.Ground:
-    draws = uniform(np.arange(3), 32, seed)
+    draws = uniform(np.arange(4), 32, seed)
+    # sand comes or goes by up to 6 cm, which moves its shores
     return ground._replace(
+        sand_level=ground.sand_level + 0.06 * change.sediment * (2.0 * draws[3] - 1.0),
         ripple_phase=ground.ripple_phase
         + change.ripples * (0.35 + 0.3 * draws[0] + 3.0 * draws[1]),
         ripple_turn=ground.ripple_turn + change.ripples * 0.5 * (draws[2] - 0.5),

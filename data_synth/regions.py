@@ -29,7 +29,7 @@ def describe_change(scene: Scene, step: float | None = None) -> dict[str, Any]:
         `regions`: a list of {classes, kind, id, polygon, volume_gain, volume_loss}, polygons in
         reference coordinates [m]: nothing of the thing is outside. Where things overlap their
         volumes [m3] are counted in each; `total` counts them once. `fields` names what changed
-        everywhere (texture) or on all sand (ripples, with polygons).
+        everywhere (texture) or on the sand of either epoch (ripples, its level; with polygons).
     """
     if scene.recipe.place.other_ground:
         return {"regions": [], "fields": {}, "total": None}
@@ -51,8 +51,13 @@ def describe_change(scene: Scene, step: float | None = None) -> dict[str, Any]:
     fields: dict[str, Any] = {}
     if change.texture > 0:
         fields["texture"] = {"strength": change.texture}
-    if change.ripples > 0 and scene.reference.seafloor.ground.sand_level > -1e8:
-        fields["ripples"] = {"strength": change.ripples, "polygons": _sand(scene, step)}
+    levels = [take.seafloor.ground.sand_level for take in (scene.reference, scene.moving)]
+    if levels[0] > -1e8 and (change.ripples > 0 or change.sediment > 0):
+        fields["sand"] = {
+            "ripples": change.ripples,
+            "rise": levels[1] - levels[0],
+            "polygons": _sand(scene, step),
+        }
     total = {"gain": float(gain[gain > 0].sum()), "loss": float(-gain[gain < 0].sum())}
     return {"regions": regions, "fields": fields, "total": total}
 

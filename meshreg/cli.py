@@ -397,8 +397,8 @@ def benchmark(
             lambda unfinished: benchmarking.benchmark(request, voice, unfinished)
         )
     except StoppedError as stopped:
-        voice.err.print("Stopped; what is done is kept: --resume goes on.")
-        return stopped.exit_code
+        stopped.add_note("what is done is kept, --resume goes on.")
+        raise
     if as_json:
         voice.document(summary)
     else:
@@ -437,7 +437,8 @@ def _failed(error: BaseException, as_json: bool, debug: bool) -> int:
         return code if isinstance(code, int) else 1
     voice = _voice(as_json)
     if isinstance(error, KeyboardInterrupt | StoppedError):
-        voice.err.print("Stopped; nothing was written.")
+        kept = getattr(error, "__notes__", ["nothing was written."])
+        voice.err.print(f"Stopped; {kept[0]}")
         return error.exit_code if isinstance(error, StoppedError) else 130
     if debug and not isinstance(error, _ClickError):
         voice.err.print("".join(traceback.format_exception(error)), markup=False)

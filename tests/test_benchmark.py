@@ -252,7 +252,8 @@ def test_a_job_whose_worker_dies_is_done_by_another(tmp_path: Path) -> None:
     assert found == {k: k * k for k in range(6)}
 
 
-def test_workers_that_keep_dying_end_the_run() -> None:
+def test_workers_that_keep_dying_end_the_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("meshreg.benchmark.workers._DEATHS", 2)
     with pytest.raises(MeshregError, match="keep dying"):
         list(run_all(_die, range(3), 1))
 
@@ -288,7 +289,12 @@ def test_the_answers_are_right_and_no_other_place_is_accepted(small: Any) -> Non
         rows = list(csv.DictReader(stream))
     fused = [r for r in rows if r["method"] == "fused" and r["kind"] == "crossing"]
     assert len(fused) == 6
+    # 8 m patches, up to 5 m apart: one of them may show too little to hold on to
+    assert sum(row["verdict"] == "rejected" for row in fused) <= 1
     for row in fused:
+        if row["verdict"] == "rejected":
+            assert row["east"] == ""
+            continue
         away = math.hypot(
             float(row["east"]) - float(row["true_east"]),
             float(row["north"]) - float(row["true_north"]),

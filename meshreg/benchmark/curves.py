@@ -111,8 +111,8 @@ def draw_severity(rows: Sequence[Row]) -> Any:
             high = np.array([rates[s]["high"] for s in x])
             color, marker = _look(method)
             axes.errorbar(
-                x + 0.012 * (shift - 1.5), share, (share - low, high - share), color=color,
-                marker=marker, markersize=5, linewidth=1.2, elinewidth=0.8, capsize=2,
+                x + 0.018 * (shift - 1.5), share, (share - low, high - share), color=color,
+                marker=marker, markersize=4.5, linewidth=1.0, elinewidth=0.8, capsize=2, alpha=0.85,
                 label=_name(method),
             )  # fmt: skip
         axes.set_title(f"{preset} ({pairs} pair{'s' if pairs != 1 else ''} a step)", fontsize=10)
@@ -121,7 +121,8 @@ def draw_severity(rows: Sequence[Row]) -> Any:
         axes.grid(alpha=0.25)
         if k == 0:
             axes.set_ylabel("share of successes")
-            axes.legend(fontsize=8, loc="lower left", framealpha=0.9)
+        else:
+            axes.legend(fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
     return figure
 
 
@@ -200,31 +201,28 @@ def draw_verdicts(verdicts: Mapping[str, Mapping[str, Any]]) -> Any:
     groups = [(name, found) for name, found in verdicts.items() if found["accepted"]["total"]]
     if not groups:
         return None
-    figure = style.new_figure(9.5, 0.55 * len(groups) + 1.8, "Verdicts", "counts in the bars")
+    figure = style.new_figure(9.5, 0.55 * len(groups) + 1.8, "Verdicts", "at the right: counts")
     axes = figure.add_subplot()
+    shown = ("accepted", "review", "rejected")
     for place, (_, found) in enumerate(groups):
         left = 0.0
-        for verdict in ("accepted", "review", "rejected"):
+        for verdict in shown:
             part = found[verdict]
             axes.barh(
                 -place, part["rate"], left=left, color=VERDICT_COLORS[verdict],
                 label=verdict if place == 0 else None,
             )  # fmt: skip
-            if part["rate"] > 0.03:
-                axes.text(left + part["rate"] / 2, -place, str(part["count"]), ha="center",
-                          va="center", fontsize=8)  # fmt: skip
             left += part["rate"]
-        wrong = found["accepted_but_wrong"]
+        wrong, counts = found["accepted_but_wrong"], [str(found[v]["count"]) for v in shown]
         known = groups[place][0] != "different places"
-        text = f"{wrong['count']} accepted but wrong" if known else ""
-        axes.text(
-            1.01, -place, text, va="center", fontsize=8, color=VERDICT_COLORS["accepted_but_wrong"]
-        )
+        text = " / ".join(counts) + (f"    {wrong['count']} accepted but wrong" if known else "")
+        color = VERDICT_COLORS["accepted_but_wrong"] if known and wrong["count"] else style.INK
+        axes.text(1.02, -place, text, va="center", fontsize=8, color=color)
     axes.set_yticks([-k for k in range(len(groups))], [name for name, _ in groups], fontsize=9)
-    axes.set_xlim(0, 1.25)
+    axes.set_xlim(0, 1.4)
     axes.set_xticks(np.linspace(0, 1, 6))
     axes.set_xlabel("share of pairs")
-    axes.legend(loc="upper center", bbox_to_anchor=(0.4, 1.22), ncols=3, frameon=False, fontsize=9)
+    axes.legend(loc="upper center", bbox_to_anchor=(0.4, 1.16), ncols=3, frameon=False, fontsize=9)
     for side in ("top", "right"):
         axes.spines[side].set_visible(False)
     return figure
@@ -236,7 +234,10 @@ def draw_reliability(rows: Sequence[Row]) -> Any:
     apart = [row for row in robust if row["kind"] == "elsewhere"]
     true = [row for row in robust if row.get("success") is not None]
     figure = style.new_figure(
-        11.0, 4.8, "How far the stated doubt can be trusted", "grey: as it should be"
+        11.0,
+        4.8,
+        "How far the stated doubt can be trusted",
+        "grey: as it should be for pairs of different places (left) and for all answers (right)",
     )
     axes = figure.add_subplot(1, 2, 1)
     _alarms(axes, apart, "different places", style.MOVING)

@@ -134,7 +134,7 @@ def _surface(
     figure.colorbar(picture, ax=axes, shrink=0.8)
     if best is not None:
         axes.scatter([best[0]], [best[1]], s=110, facecolors="none", edgecolors=style.MOVING,
-                     linewidths=1.6, zorder=4)  # fmt: skip
+                     linewidths=1.6, zorder=4, clip_on=False)  # fmt: skip
         axes.set_xlabel(
             f"east [m]    {estimate.status}: ({best[0]:+.2f}, {best[1]:+.2f}) m", fontsize=9
         )

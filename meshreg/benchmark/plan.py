@@ -46,6 +46,7 @@ PAPER_RADIUS = 6.0  # m; the direct count takes its time, and offsets are within
 PAPER_PAIRS = 10  # of each of the paper's sites go through the slow preset
 PAPER_LADDER = 5  # of each step of the ladder
 OTHERS = 4  # pairs of each further recipe, taken as it stands
+OWN_SIZE = 1.25  # recipes as they stand have their own size, but at most so many times the run's
 MOST_SITES = 60  # whose rasters are kept, to be crossed
 FORMATS = ("obj", "ply", "laz", "glb")
 Kind = Literal["crossing", "ladder", "scenario", "table", "files", "site", "elsewhere"]
@@ -64,7 +65,7 @@ class Options:
     elsewhere : int
         Pairs that show different places.
     size : float
-        Side of the patches [m].
+        Side of the patches [m]; recipes as they stand have their own, up to 1.25 times this.
     seed : int
     """
 
@@ -196,12 +197,16 @@ def _seed(*parts: Any) -> int:
     return int.from_bytes(hashlib.sha256(text.encode()).digest()[:4], "big") % 2**30
 
 
+def _own_size(name: str, options: Options) -> float:
+    return min(load(name).output.size, OWN_SIZE * options.size)
+
+
 def _table_jobs(options: Options, chosen: tuple[str, ...]) -> Iterator[Job]:
     """Take the paper's sites with the paper's own offsets and residuals."""
     for name in PAPER_SITES:
         if name in chosen:
             seed = _seed(options.seed, "table", name, 0)
-            yield Job("table", name, 0, seed, options.size, ("robust", "paper"))
+            yield Job("table", name, 0, seed, _own_size(name, options), ("robust", "paper"))
 
 
 def _file_jobs(options: Options, chosen: tuple[str, ...]) -> Iterator[Job]:
@@ -209,10 +214,8 @@ def _file_jobs(options: Options, chosen: tuple[str, ...]) -> Iterator[Job]:
     whole = ["severity_05" if name == "severity" else name for name in scenarios()]
     for k, name in enumerate(whole):
         if name in chosen or (name == "severity_05" and "severity" in chosen):
-            form = FORMATS[k % len(FORMATS)]
-            yield Job(
-                "files", name, 0, _seed(options.seed, "files", name, 0), options.size, format=form
-            )
+            seed, size = _seed(options.seed, "files", name, 0), _own_size(name, options)
+            yield Job("files", name, 0, seed, size, format=FORMATS[k % len(FORMATS)])
 
 
 def _crossing_jobs(options: Options, chosen: tuple[str, ...]) -> Iterator[Job]:
@@ -235,7 +238,7 @@ def _other_jobs(options: Options, chosen: tuple[str, ...]) -> Iterator[Job]:
         if name in chosen and name not in CROSSING and name != "severity":
             for k in range(min(options.repeats, OTHERS)):
                 seed = _seed(options.seed, "scenario", name, k)
-                yield Job("scenario", name, k, seed, options.size)
+                yield Job("scenario", name, k, seed, _own_size(name, options))
 
 
 def site_count(pairs: int) -> int:

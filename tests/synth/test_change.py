@@ -62,7 +62,10 @@ def test_each_class_changes_its_polygons_and_nothing_else(name):
     regions = described["regions"]
     assert regions
     assert {c for region in regions for c in region["classes"]} == {name}
-    inside = within([region["polygon"] for region in regions], scene, x, y)
+    polygons = [region["polygon"] for region in regions]
+    if name == "sediment":  # the sand that was there rises or falls as well
+        polygons += described["fields"]["sand"]["polygons"]
+    inside = within(polygons, scene, x, y)
     assert not (differs & ~inside).any()
     # and most regions do show it (some lie under another thing)
     shows = [
@@ -84,7 +87,7 @@ def test_ripples_change_the_sand_alone():
     x, y, rise, differs = sampled(scene)
     described = describe_change(scene)
     assert described["regions"] == []
-    sand = within(described["fields"]["ripples"]["polygons"], scene, x, y)
+    sand = within(described["fields"]["sand"]["polygons"], scene, x, y)
     assert not (differs & ~sand).any()
     assert differs[sand].mean() > 0.3
     assert 0.001 < np.abs(rise[differs]).mean() < 0.05
