@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from data_synth.seeing_kernels import light_at, through_water
+from data_synth.seeing_kernels import image_gains, light_at, through_water
 from meshreg.jit import jit, prange
 
 BLOCK = 16  # samples
@@ -76,7 +76,7 @@ def photograph(z, soft, wide, albedo, step, west, north, centre, turn, focal, sh
     """
     tall, wide_px = shape
     out = np.zeros((tall, wide_px, 3), np.float32)
-    ceiling = ceilings(z)
+    ceiling, gains = ceilings(z), image_gains(image, plan)
     high = centre[2] - z.mean()
     for v in prange(tall):
         for u in range(wide_px):
@@ -105,7 +105,7 @@ def photograph(z, soft, wide, albedo, step, west, north, centre, turn, focal, sh
                 p * a0[1] + q * a1[1] + r * b0[1] + t * b1[1],
                 p * a0[2] + q * a1[2] + r * b0[2] + t * b1[2],
             )
-            through_water(color, light, view, high, image, plan, out[v, u])
+            through_water(color, light, view, high, gains, plan, out[v, u])
     return out
 
 

@@ -55,13 +55,15 @@ class Plan(NamedTuple):
     """One survey's seeing with everything drawn: one flat tuple for the kernels."""
 
     seed: int
-    heading: float
+    heading_cos: float
+    heading_sin: float
     track_spacing: float
     image_spacing: float
     seam_noise: float
     altitude: float
-    azimuth: float
-    elevation: float
+    sun_east: float  # of the unit vector towards the sun
+    sun_north: float
+    sun_up: float
     sun: float
     ambient: float
     strobe: float
@@ -82,17 +84,23 @@ class Plan(NamedTuple):
 
 def make_plan(seeing: Seeing, rng: np.random.Generator) -> Plan:
     """Draw the headings and lights of one survey."""
+    seed = int(rng.integers(2**30))
+    heading = math.radians(draw(seeing.heading, rng))
+    azimuth = math.radians(draw(seeing.sun_azimuth, rng))
+    elevation = math.radians(draw(seeing.sun_elevation, rng))
     red, green, blue = seeing.attenuation
     haze_red, haze_green, haze_blue = seeing.haze
     return Plan(
-        seed=int(rng.integers(2**30)),
-        heading=math.radians(draw(seeing.heading, rng)),
+        seed=seed,
+        heading_cos=math.cos(heading),
+        heading_sin=math.sin(heading),
         track_spacing=seeing.track_spacing,
         image_spacing=seeing.image_spacing,
         seam_noise=0.25,
         altitude=seeing.altitude,
-        azimuth=math.radians(draw(seeing.sun_azimuth, rng)),
-        elevation=math.radians(draw(seeing.sun_elevation, rng)),
+        sun_east=math.cos(elevation) * math.sin(azimuth),
+        sun_north=math.cos(elevation) * math.cos(azimuth),
+        sun_up=math.sin(elevation),
         sun=seeing.sun,
         ambient=seeing.ambient,
         strobe=seeing.strobe,

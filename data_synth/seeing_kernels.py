@@ -19,15 +19,16 @@ def nearest_camera(x, y, plan):
     Cameras stand on a lattice of tracks and exposures, strewn by navigation; the mosaic takes
     each texel from the nearest one.
     """
-    c, s = math.cos(plan.heading), math.sin(plan.heading)
+    c, s = plan.heading_cos, plan.heading_sin
     along, across = (c * x + s * y) / plan.image_spacing, (c * y - s * x) / plan.track_spacing
     stray = plan.seam_noise * gradient_noise(x * 3.0, y * 3.0, plan.seed + 1)
     across += stray
     along += plan.seam_noise * gradient_noise(x * 3.0, y * 3.0, plan.seed + 2)
-    ia, ic = math.floor(along), math.floor(across)
+    # cameras stray by a quarter of their spacing at most: the nearest one is of four
+    ia, ic = math.floor(along - 0.5), math.floor(across - 0.5)
     best, dx, dy, na, nc = 1e30, 0.0, 0.0, 0, 0
-    for j in range(-1, 2):
-        for i in range(-1, 2):
+    for j in range(2):
+        for i in range(2):
             h = hash2(ia + i, ic + j, plan.seed + 3)
             ca = ia + i + 0.25 + 0.5 * np.float64(h & 0xFFFF) / 65536.0
             cc = ic + j + 0.325 + 0.35 * np.float64((h >> 16) & 0xFFFF) / 65536.0
@@ -79,11 +80,11 @@ def light_at(z, soft, wide, i, j, step, x, y, mirror, away, high, image, plan):
     around = min(1.15, max(0.4, 1.0 + 0.2 * plan.crevice * (z[i, j] - wide[i, j])))
     light = plan.ambient * near * around * (0.5 + 0.5 * norm)
     if plan.sun > 0.0:
-        sun_x, sun_y = math.sin(plan.azimuth) * mirror, math.cos(plan.azimuth)
-        lie, rise = math.cos(plan.elevation), math.sin(plan.elevation)
-        sun = (rise - lie * (gx * sun_x + gy * sun_y)) * norm
+        sx, sy, rise = plan.sun_east * mirror, plan.sun_north, plan.sun_up
+        sun = (rise - gx * sx - gy * sy) * norm
+        lie = math.sqrt(sx * sx + sy * sy) + 1e-9
         if sun > 0.0:
-            sun *= shadow(z, i, j, step, sun_x, sun_y, rise / lie)
+            sun *= shadow(z, i, j, step, sx / lie, sy / lie, rise / lie)
             light += plan.sun * sun * min(1.0, near + 0.2)
     if plan.caustics > 0.0:
         salt = plan.seed + 31 * image[0] + 17 * image[1]
@@ -92,7 +93,7 @@ def light_at(z, soft, wide, i, j, step, x, y, mirror, away, high, image, plan):
         light *= 1.0 + plan.caustics * (1.5 * math.exp(-22.0 * min(a, b)) - 0.45)
     if plan.strobe > 0.0:
         # a pair of lamps fore and aft of the camera and a little to one side
-        c, s = math.cos(plan.heading), math.sin(plan.heading)
+        c, s = plan.heading_cos, plan.heading_sin
         flash = 0.0
         for k in range(2):
             along = plan.strobe_arm if k == 0 else -plan.strobe_arm
@@ -113,18 +114,30 @@ def light_at(z, soft, wide, i, j, step, x, y, mirror, away, high, image, plan):
 
 
 @jit(nogil=True, error_model="numpy")
-def through_water(albedo, light, view, high, image, plan, out):
+def image_gains(image, plan):
+    """Return for each channel the exposure of one image, and the mean loss that is put back."""
+    gain = 1.0 + plan.seams * (2.0 * hash01(image[0], image[1], plan.seed + 7) - 1.0)
+    back = plan.altitude * plan.corrected
+    return (
+        gain * (1.0 + 0.5 * plan.seams * (hash01(image[0], image[1], plan.seed + 8) - 0.5)),
+        gain * (1.0 + 0.5 * plan.seams * (hash01(image[0], image[1], plan.seed + 9) - 0.5)),
+        gain * (1.0 + 0.5 * plan.seams * (hash01(image[0], image[1], plan.seed + 10) - 0.5)),
+        math.exp(plan.attenuation_red * back),
+        math.exp(plan.attenuation_green * back),
+        math.exp(plan.attenuation_blue * back),
+    )
+
+
+@jit(nogil=True, error_model="numpy")
+def through_water(albedo, light, view, high, gains, plan, out):
     """Put what a camera at distance `view` [m] sees of a lit spot into `out` (3,)."""
     edge = (high / view) ** (4.0 * plan.vignette)
-    gain = edge * (1.0 + plan.seams * (2.0 * hash01(image[0], image[1], plan.seed + 7) - 1.0))
     attenuation = (plan.attenuation_red, plan.attenuation_green, plan.attenuation_blue)
     haze = (plan.haze_red, plan.haze_green, plan.haze_blue)
     for k in range(3):
         left = math.exp(-attenuation[k] * view)
-        clear = left * math.exp(attenuation[k] * plan.altitude * plan.corrected)
         veil = haze[k] * (1.0 - left)
-        tint = 1.0 + 0.5 * plan.seams * (hash01(image[0], image[1], plan.seed + 8 + k) - 0.5)
-        out[k] = (albedo[k] * light * clear + veil) * gain * tint
+        out[k] = (albedo[k] * light * left * gains[3 + k] + veil) * edge * gains[k]
 
 
 @jit(parallel=True, nogil=True, error_model="numpy")
@@ -144,17 +157,20 @@ def radiance(z, soft, wide, albedo, step, west, north, mirror, plan):
     """
     rows, cols = z.shape
     out = np.empty((rows, cols, 3), np.float32)
-    c, s = math.cos(plan.heading), math.sin(plan.heading)
+    c, s = plan.heading_cos, plan.heading_sin
     for i in prange(rows):
         y = north - i * step
+        last_na, last_nc, gains = 0, 0, image_gains((0, 0), plan)
         for j in range(cols):
             x = west + j * step
             da, dc, na, nc, high = nearest_camera(x, y, plan)
+            if na != last_na or nc != last_nc:
+                last_na, last_nc, gains = na, nc, image_gains((na, nc), plan)
             away = (c * da - s * dc, s * da + c * dc)
             light = light_at(z, soft, wide, i, j, step, x, y, mirror, away, high, (na, nc), plan)
             view = math.sqrt(da * da + dc * dc + high * high)
             color = (albedo[i, j, 0], albedo[i, j, 1], albedo[i, j, 2])
-            through_water(color, light, view, high, (na, nc), plan, out[i, j])
+            through_water(color, light, view, high, gains, plan, out[i, j])
     return out
 
 
