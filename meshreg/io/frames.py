@@ -84,8 +84,7 @@ def place(
     xyz = np.asarray(xyz)
     if not len(xyz):
         raise InputError("holds no points.", file=path, remedy="Export it again.")
-    # By columns: ten times faster than along the first axis.
-    ends = np.array([[f(xyz[:, k]) for k in range(3)] for f in (np.min, np.max)], float)
+    ends = _ends(xyz)
     if not np.isfinite(ends).all():
         raise InputError(f"has coordinates {ends.tolist()} that are not finite.", file=path)
     notes = _single_precision_note(path, xyz, ends)
@@ -104,6 +103,18 @@ def place(
         _LOG.warning("%s: %s", path.name, note)
     said = sidecar or SidecarInfo()
     return Placed(points, origin, frame, notes, said.path, said.name, said.date)
+
+
+def _ends(xyz: Any) -> Float64:
+    """Return (2, 3) lowest and highest of each column."""
+    # Rows taken 64 at a time: NumPy is slow along the first axis of three columns.
+    whole = len(xyz) // 64 * 64
+    wide = xyz[:whole].reshape(-1, 64 * 3)
+    found = []
+    for end in (np.min, np.max):
+        parts = [end(wide, axis=0).reshape(64, 3)] if whole else []
+        found.append(end(np.concatenate([*parts, xyz[whole:]]), axis=0))
+    return np.asarray(found, np.float64)
 
 
 def _from_origin(frame: Frame, xyz: Any, origin: Float64) -> Float64:

@@ -114,8 +114,9 @@ def in_order(
     `work` must not depend on earlier blocks, and gains where it holds no lock. Small files
     (`n_bytes`) are worked on at once.
     """
-    threads = min(_MAX_THREADS, os.cpu_count() or 1)
-    if threads == 1 or n_bytes <= 4 * BLOCK:
+    cores = os.cpu_count() or 1
+    threads = min(_MAX_THREADS, cores + 1)  # one more, for while the file is waited for
+    if cores == 1 or n_bytes <= 4 * BLOCK:
         for block in blocks:
             yield block, work(block)
         return

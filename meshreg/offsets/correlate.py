@@ -121,24 +121,23 @@ class Correlator:
 
     def sums(self, *pairs: tuple[Complex, Complex]) -> Float64:
         """``sum over pairs of sum_r a[r + s] b[r]`` for each offset, (K, L) float64."""
-        from scipy.fft import irfft2
-
         product = pairs[0][0] * np.conj(pairs[0][1])
         for a, b in pairs[1:]:
             product += a * np.conj(b)
-        size = self.window.padded
-        whole = irfft2(product, s=size, workers=WORKERS)
-        rows, cols = self.window.rows % size[0], self.window.cols % size[1]
-        return np.asarray(whole[np.ix_(rows, cols)], np.float64)
+        cols = self.window.cols % self.window.padded[1]
+        return np.asarray(self.rows_back(product)[:, cols], np.float64)
 
-    def many(self, a: Complex, b: Any) -> Any:
-        """``sum_r a[r + s] b_k[r]`` for several b_k at once; `b` holds conjugates (B, ...)."""
-        from scipy.fft import irfft2
+    def rows_back(self, product: Any) -> Any:
+        """Inverse transform (..., K, padded columns) of the window's rows alone.
+
+        Transforming the columns first leaves only the rows that are asked for to the second pass.
+        """
+        from scipy.fft import ifft, irfft
 
         size = self.window.padded
-        whole = irfft2(a[None] * b, s=size, axes=(1, 2), workers=WORKERS)
-        rows, cols = self.window.rows % size[0], self.window.cols % size[1]
-        return whole[:, rows[:, None], cols[None, :]]
+        half = ifft(product, axis=-2, workers=WORKERS, overwrite_x=True)
+        asked = half[..., self.window.rows % size[0], :]
+        return irfft(asked, n=size[1], axis=-1, workers=WORKERS, overwrite_x=True)
 
     def counts(self, a: Complex, b: Complex) -> Float64:
         """Like `sums`, of two masks: whole numbers."""

@@ -61,10 +61,27 @@ def _information(joint: Any, bins: int) -> float:
 
 
 @jit(parallel=True, nogil=True)
-def add_looked_up(total: Any, counts: Any, table: Any) -> None:
-    """Add ``sum over b of table[round(counts[b])]`` to each cell of `total`."""
-    rows, cols = total.shape
-    for i in prange(rows):
-        for b in range(counts.shape[0]):
-            for j in range(cols):
-                total[i, j] += table[max(int(counts[b, i, j] + 0.5), 0)]
+def add_entropies(total: Any, marginal: Any, counts: Any, cols: Any, table: Any) -> None:
+    """Take one level of the first image against all of the second's.
+
+    With ``n_b = round(counts[b, :, cols])``, add ``sum over b of table[n_b]`` less the table at
+    the sum of n_b to each cell of `total`, and n_b to `marginal` (K, L, B).
+    """
+    for i in prange(total.shape[0]):
+        for j in range(len(cols)):
+            whole, joint = 0, 0.0
+            for b in range(counts.shape[0]):
+                n = max(int(counts[b, i, cols[j]] + 0.5), 0)
+                marginal[i, j, b] += n
+                whole += n
+                joint += table[n]
+            total[i, j] += joint - table[whole]
+
+
+@jit(parallel=True, nogil=True)
+def subtract_marginals(total: Any, marginal: Any, table: Any) -> None:
+    """Subtract ``sum over b of table[marginal[:, :, b]]`` from each cell of `total`."""
+    for i in prange(total.shape[0]):
+        for j in range(total.shape[1]):
+            for b in range(marginal.shape[2]):
+                total[i, j] -= table[marginal[i, j, b]]

@@ -99,36 +99,35 @@ def fft_surface(
     grows as 1e-7 times the geometric mean of the two sets' sizes and the logarithm of the image).
     """
     exact = Correlator(window)
-    mask1, mask2 = (exact.transform(mask) for mask in masks)
-    counts = exact.counts(mask1, mask2)
+    counts = exact.counts(*(exact.transform(mask) for mask in masks))
     scored = overlap_floor(counts, min_overlap)
     sets1 = [(first == level) & masks[0] for level in range(bins)]
     sets2 = [(second == level) & masks[1] for level in range(bins)]
-    marginals = np.zeros(counts.shape)
-    for mask, sets in ((mask2, sets1), (mask1, sets2)):
-        for members in sets:
-            spectrum = exact.transform(members)
-            pair = (spectrum, mask) if sets is sets1 else (mask, spectrum)
-            marginals += _n_log_n(exact.counts(*pair))
-    largest = max(int(members.sum()) for members in (*sets1, *sets2))
-    joint = _joint_sum(sets1, sets2, Correlator(window, single=largest <= SINGLE_CELLS), largest)
     n = np.maximum(counts, 1.0)
-    information = (joint - marginals) / n + np.log(n)
+    information = _sum_of_n_log_n(sets1, sets2, window) / n + np.log(n)
     return np.where(scored, information, np.nan), counts
 
 
-def _joint_sum(
-    sets1: list[Bool], sets2: list[Bool], correlator: Correlator, largest: int
-) -> Float64:
-    """``sum over a, b of n_ab ln n_ab`` for each offset; logarithms from a table."""
-    from meshreg.offsets.kernels import add_looked_up
+def _sum_of_n_log_n(sets1: list[Bool], sets2: list[Bool], window: Window) -> Float64:
+    """``sum n_ab ln n_ab - sum n_a ln n_a - sum n_b ln n_b`` for each offset.
 
+    The sets of each image are disjoint and fill its mask, so the marginal counts over the overlap
+    are sums of the joint ones. Logarithms come from a table.
+    """
+    from meshreg.offsets.kernels import add_entropies, subtract_marginals
+
+    largest = max(int(members.sum()) for members in (*sets1, *sets2))
+    correlator = Correlator(window, single=largest <= SINGLE_CELLS)
     table = _n_log_n(np.arange(largest + 1, dtype=np.float64))
     conjugates = np.stack([np.conj(correlator.transform(members)) for members in sets2])
-    total = np.zeros((len(correlator.window.rows), len(correlator.window.cols)))
+    cols = window.cols % window.padded[1]
+    total = np.zeros((len(window.rows), len(cols)))
+    marginal = np.zeros((len(window.rows), len(cols), len(sets2)), np.int32)
+    product = np.empty_like(conjugates)
     for members in sets1:
-        spectrum = correlator.transform(members)
-        add_looked_up(total, correlator.many(spectrum, conjugates), table)
+        np.multiply(correlator.transform(members), conjugates, out=product)
+        add_entropies(total, marginal, correlator.rows_back(product), cols, table)
+    subtract_marginals(total, marginal, table)
     return total
 
 

@@ -28,6 +28,13 @@ def resident() -> float:
         return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
+def timed(function: Any, *arguments: Any) -> float:
+    """Call in this process and return the seconds; nothing watches, which would slow threads."""
+    began = time.perf_counter()
+    function(*arguments)
+    return time.perf_counter() - began
+
+
 def here(function: Any, *arguments: Any) -> dict[str, float]:
     """Call in this process: seconds, and how far the memory rose above where it stood [MB]."""
     base, top, done = resident(), [0.0], threading.Event()

@@ -40,13 +40,10 @@ def make(folder: Path, rows: int, cols: int, name: str) -> Path:
 
 
 def _best(read: Callable[[str], Any], small: str, path: str) -> dict[str, Any]:
-    """Read once to compile and import, then report the fastest of five."""
+    """Read once to compile and import, once for the memory, then report the fastest of five."""
     read(small)
-    runs = [measure.here(read, path) for _ in range(5)]
-    return {
-        "seconds": min(run["seconds"] for run in runs),
-        "peak_mb": max(run["peak_mb"] for run in runs[:1]),
-    }
+    peak = measure.here(read, path)["peak_mb"]
+    return {"seconds": min(measure.timed(read, path) for _ in range(5)), "peak_mb": peak}
 
 
 def meshreg(small: str, path: str) -> dict[str, Any]:
