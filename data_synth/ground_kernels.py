@@ -18,15 +18,15 @@ def _noise(x, y, seed, wavelength, finest, gain, count):
 
 
 @jit(nogil=True, error_model="numpy")
-def _mixed(x, y, ground, salt, wavelength, finest, count):
+def _mixed(x, y, ground, salt, wavelength, finest, gain, count):
     """Noise whose share `ground.mix` belongs to the epoch; its variance does not change."""
     out = np.zeros(x.size)
     old = math.sqrt(1.0 - ground.mix * ground.mix)
     if old > 0.0:
-        octaves_into(x, y, ground.seed + salt, wavelength, finest, 0.7, count, old, out)
+        octaves_into(x, y, ground.seed + salt, wavelength, finest, gain, count, old, out)
     if ground.mix > 0.0:
         own = ground.mix_seed + salt
-        octaves_into(x, y, own, wavelength, finest, 0.7, count, ground.mix, out)
+        octaves_into(x, y, own, wavelength, finest, gain, count, ground.mix, out)
     return out
 
 
@@ -120,10 +120,9 @@ def rock_height(x, y, ground, finest):
         tall *= ground.lump_gain
         presence = 0.85
     cover = _rubble(x, y, wx, wy, ground, finest, z, shade)
-    grit = np.zeros(n)
-    octaves_into(x, y, ground.seed + 6, 0.20, finest, gain, 5, ground.grit, grit)
+    grit = _mixed(x, y, ground, 6, 0.20, finest, gain, 5)
     for i in range(n):
-        z[i] += rough[i] * grit[i]
+        z[i] += ground.grit * rough[i] * grit[i]
     return z, shade, cover
 
 
@@ -146,11 +145,16 @@ def _rubble(x, y, wx, wy, ground, finest, z, shade):
     for k in range(2):
         size = 0.11 if k == 0 else 0.05
         if size * 0.5 > finest:
-            lumps_into(wx, wy, size, 0.3 * k, ground.seed + 40 + k, 0.95, up, own)
-            for i in range(n):
-                z[i] += cover[i] * 0.28 * size * up[i]
-                there = cover[i] if up[i] > 0.0 else 0.0
-                shade[i] += there * (_epoch_number(own[i], ground) - shade[i])
+            for epoch in range(2):  # pieces that lay there before, and those that came since
+                share = ground.mix if epoch == 1 else 1.0 - ground.mix
+                if share <= 0.0:
+                    continue
+                seed = (ground.mix_seed if epoch == 1 else ground.seed) + 40 + k
+                lumps_into(wx, wy, size, 0.3 * k, seed, 0.95 * share, up, own)
+                for i in range(n):
+                    z[i] += cover[i] * 0.28 * size * up[i]
+                    there = cover[i] if up[i] > 0.0 else 0.0
+                    shade[i] += there * (own[i] - shade[i])
     return cover
 
 
@@ -180,9 +184,9 @@ def rock_color(x, y, ground, shade, cover, finest, out):
     """Put the reflectance of rock, turf, coralline crust and rubble into `out` (N, 3)."""
     n = x.size
     zone = _noise(x, y, ground.seed + 50, 1.3, finest, 0.6, 2)
-    patch = _mixed(x, y, ground, 51, 0.35, finest, 4)
-    fine = _mixed(x, y, ground, 52, 0.055, finest, 3)
-    grain = _mixed(x, y, ground, 53, 0.010, finest, 2)
+    patch = _mixed(x, y, ground, 51, 0.35, finest, 0.7, 4)
+    fine = _mixed(x, y, ground, 52, 0.055, finest, 0.7, 3)
+    grain = _mixed(x, y, ground, 53, 0.010, finest, 0.7, 2)
     # crusts of sponge, bryozoans, barnacles, holes
     blots = np.zeros(n)
     if finest < 0.06:
@@ -192,13 +196,15 @@ def rock_color(x, y, ground, shade, cover, finest, out):
     for i in range(n):
         f, p, g, h = fine[i], patch[i], grain[i], shade[i]
         spot = blots[i]
-        tone = max(0.25, 1.0 + 0.16 * p + 0.20 * f + 0.09 * g + 0.55 * spot)
+        f, g, spot = ground.fine * f, ground.fine * g, ground.fine * spot
+        wide = ground.patch * zone[i]
+        tone = max(0.25, 1.0 + 0.10 * wide + 0.16 * p + 0.20 * f + 0.09 * g + 0.55 * spot)
         # bare limestone or basalt
         low = 0.19 * (0.45 + 1.05 * h) * tone
         red, green = low * ground.tone_red, low * ground.tone_green
         blue = low * ground.tone_blue
         # turf: olive to brown, darker, in patches with ragged edges
-        t = 0.7 * zone[i] + p + 0.35 * f + 1.6 * ground.turf - 0.6
+        t = (0.7 + 0.8 * ground.patch) * zone[i] + p + 0.35 * f + 1.6 * ground.turf - 0.6
         t = ground.turf * smoothstep(-1.1, 0.6, t)
         hue = 0.5 + 0.25 * p
         low = 0.075 * (0.55 + 0.9 * h) * max(0.2, tone + 0.12 * f)
@@ -235,9 +241,9 @@ def add_turf(x, y, ground, shade, turf, finest, out):
 @jit(nogil=True, error_model="numpy")
 def add_sand(x, y, ground, share, crest, finest, out):
     """Lay sand over `out` (N, 3) where `share` (0..1) says: debris in troughs, shell grit."""
-    patch = _mixed(x, y, ground, 60, 0.9, finest, 3)
-    fine = _mixed(x, y, ground, 61, 0.05, finest, 3)
-    grain = _mixed(x, y, ground, 62, 0.008, finest, 2)
+    patch = _mixed(x, y, ground, 60, 0.9, finest, 0.7, 3)
+    fine = _mixed(x, y, ground, 61, 0.05, finest, 0.7, 3)
+    grain = _mixed(x, y, ground, 62, 0.008, finest, 0.7, 2)
     shells = ground.mix_seed + 63 if ground.mix > 0.5 else ground.seed + 63
     for i in range(x.size):
         if share[i] <= 0.0:

@@ -45,6 +45,8 @@ class Site:
     rubble: float = 0.3
     turf: float = 0.8
     coralline: float = 0.5
+    patch: float = 1.0
+    fine: float = 1.0
     tone: tuple[float, float, float] = (1.0, 0.88, 0.68)
     sand_tone: tuple[float, float, float] = (0.46, 0.41, 0.31)
     boulder: float = 0.0
@@ -100,6 +102,8 @@ def bare_ground(site: Site, seed: int) -> t.Ground:
         rubble=site.rubble,
         turf=site.turf,
         coralline=site.coralline,
+        patch=site.patch,
+        fine=site.fine,
         tone_red=site.tone[0],
         tone_green=site.tone[1],
         tone_blue=site.tone[2],

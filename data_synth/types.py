@@ -72,6 +72,8 @@ class Ground(NamedTuple):
     rubble: float  # 0 none .. 1 everywhere outside the sand
     turf: float  # 0 bare .. 1 turf everywhere
     coralline: float  # 0..1 pink crusts
+    patch: float  # contrast of bare and turfed patches of half a metre to two
+    fine: float  # contrast of all that is smaller than a hand
     tone_red: float  # tint of the rock
     tone_green: float
     tone_blue: float

@@ -316,19 +316,27 @@ def demo(
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the result.")] = Path(
         "meshreg_demo"
     ),
+    real: Annotated[
+        bool, typer.Option("--real", help="Two drone surveys of a beach instead of a made reef.")
+    ] = False,
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
     debug: DebugOption = False,
 ) -> int:
-    """Do the main job on a small pair of surveys that travels with the package."""
+    """Make two surveys of a reef, do the main job on them, and compare with the truth."""
     del debug
-    from meshreg.cli_parts.registering import demo_request
+    from meshreg.cli_parts import demonstrating
+    from meshreg.cli_parts.guard import run_stoppable
 
     voice = _voice(as_json)
-    request = demo_request(out, overwrite)
-    voice.say("Two drone surveys of one beach, eight months apart; the later one was moved on")
-    voice.say("purpose. To find: about +13.4 m east, -8.7 m north, +1.25 m up, within 2 m.")
-    return _do_register(request, voice)
+    demonstrating.introduce(real, voice)
+    job = demonstrating.real if real else demonstrating.made
+    done = run_stoppable(lambda unfinished: job(out, overwrite, voice, unfinished))
+    if as_json:
+        voice.document(demonstrating.document(done))
+    else:
+        demonstrating.show(done, out, voice)
+    return 0 if done.registration.verdict == "accepted" else 4
 
 
 @app.command()

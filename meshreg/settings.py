@@ -43,6 +43,9 @@ class SearchSettings:
         None  # per axis [m]; None: 10 m, more where the DEM is coarser than 0.10 m
     )
     min_overlap: float = 0.10  # of the largest in the window (paper: 0.30); less is not scored
+    max_yaw: float = 8.0  # [degrees] either way; with max_scale 0 too, offsets alone are searched
+    max_scale: float = 0.03  # either way from 1
+    free_scale: bool = False  # True: fit the scale too; otherwise it stays 1 unless plainly wrong
 
 
 @dataclass(frozen=True)
@@ -90,6 +93,14 @@ class JudgeSettings:
 
 
 @dataclass(frozen=True)
+class WarpSettings:
+    """The non-rigid answer (`meshreg.warp`); the internal error is measured whatever this says."""
+
+    model: str = "none"  # "auto", or one of "similarity", "dome", "quadratic", "spline"
+    max_strain: float = 0.01  # a bend that strains the survey by more is not applied
+
+
+@dataclass(frozen=True)
 class Settings:
     """All stages together."""
 
@@ -102,6 +113,7 @@ class Settings:
     terrain: TerrainSettings = field(default_factory=TerrainSettings)
     mutual_information: MutualInformationSettings = field(default_factory=MutualInformationSettings)
     judge: JudgeSettings = field(default_factory=JudgeSettings)
+    warp: WarpSettings = field(default_factory=WarpSettings)
 
     @classmethod
     def from_preset(cls, preset: str) -> Settings:
@@ -111,7 +123,7 @@ class Settings:
         if preset == "paper":
             return cls(
                 preset="paper",
-                search=SearchSettings(min_overlap=0.30),
+                search=SearchSettings(min_overlap=0.30, max_yaw=0.0, max_scale=0.0),
                 sift=SiftSettings(exhaustive_vote=False, ratio=1.0),
                 terrain=TerrainSettings(high_pass=()),
                 mutual_information=MutualInformationSettings(bins=256, high_pass=0.0, direct=True),

@@ -731,7 +731,7 @@ def test_bars_on_a_terminal() -> None:
     assert "100%" in said
 
 
-# ---- the real thing, on the pair that the package carries ---------------------------------------
+# ---- the real thing, on the pair that the package carries (the made one: test_demo.py) ----------
 
 TRUTH = np.array([13.4, -8.7, 1.25])
 DEMO = Path(meshreg.__file__).parent / "demo_data"
@@ -739,9 +739,9 @@ DEMO = Path(meshreg.__file__).parent / "demo_data"
 
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
-    """The demonstration as a user runs it, in a process of its own."""
+    """The demonstration on real beaches as a user runs it, in a process of its own."""
     out = tmp_path_factory.mktemp("demo") / "out"
-    command = [sys.executable, "-m", "meshreg", "demo", "-o", str(out), "--json"]
+    command = [sys.executable, "-m", "meshreg", "demo", "--real", "-o", str(out), "--json"]
     done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=False)
     assert done.returncode == 0, done.stderr + done.stdout
     assert done.stderr == ""
@@ -803,7 +803,7 @@ def test_same_seed_gives_the_same_answer(
     demo: tuple[Path, dict[str, Any]], tmp_path: Path, run: Run
 ) -> None:
     _, first = demo
-    code, said, _ = run("demo", "-o", tmp_path / "out", "--json")
+    code, said, _ = run("demo", "--real", "-o", tmp_path / "out", "--json")
     second = json.loads(said)
     assert code == 0
     assert second["offset"] == first["offset"]

@@ -31,6 +31,12 @@ class SurveyRequest:
 
     path: str
     options: ReadOptions
+    called: str = ""  # in the log, where the path is a passing one
+
+    @property
+    def name(self) -> str:
+        """What the log calls it."""
+        return self.called or self.path
 
 
 @contextmanager
@@ -67,7 +73,7 @@ def read(request: SurveyRequest, name: str = "") -> Survey:
     from meshreg.io import read_survey
 
     survey = read_survey(request.path, request.options)
-    LOG.info("%s: %s from %s", name or "survey", survey.name, request.path)
+    LOG.info("%s: %s from %s", name or "survey", survey.name, request.name)
     for note in survey.notes:
         LOG.info("%s: %s", survey.name, note)
     return survey

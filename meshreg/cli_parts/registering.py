@@ -1,4 +1,4 @@
-"""`meshreg register` and `meshreg demo`."""
+"""`meshreg register`."""
 
 from __future__ import annotations
 
@@ -24,8 +24,6 @@ from meshreg.settings import Settings
 if TYPE_CHECKING:
     from meshreg.types import Registration
 
-DEMO = Path(__file__).parent.parent / "demo_data"
-
 
 @dataclass(frozen=True)
 class RegisterRequest:
@@ -41,54 +39,59 @@ class RegisterRequest:
 
 def register(request: RegisterRequest, voice: Voice, unfinished: Unfinished) -> Registration:
     """Run the main job: read, register, write OUT whole."""
+    with (
+        new_folder(request.out, request.overwrite, unfinished, "registration.json") as folder,
+        logging_to(voice, folder / "log.txt"),
+        Progress(voice) as progress,
+    ):
+        return register_into(folder, request, progress)
+
+
+def register_into(folder: Path, request: RegisterRequest, progress: Progress) -> Registration:
+    """Read, register, write everything into a folder that is there already."""
     from meshreg.io import same_files, unchanged
     from meshreg.io.frames import common_crs
     from meshreg.io.record import with_frames, write_record_files
     from meshreg.pipeline import register_pair
     from meshreg.report import draw_figures
 
-    with (
-        new_folder(request.out, request.overwrite, unfinished, "registration.json") as folder,
-        logging_to(voice, folder / "log.txt"),
-        Progress(voice) as progress,
-    ):
-        _log_start(request)
-        clock = time.perf_counter()
-        progress("read", 0.0)
-        reference = read(request.reference, "reference")
-        progress("read", 0.5)
-        moving = read(request.moving, "moving")
-        notes = []
-        if same := same_files(reference, moving):
-            notes.append(same)
-        moving, crs_notes = common_crs(reference, moving)
-        notes += crs_notes
-        for note in notes:
-            LOG.warning("%s", note)
-        require_disk(folder, moving)
-        masks = read_masks(request.masks, reference.crs)
-        reading = time.perf_counter() - clock
-        registration = register_pair(
-            reference,
-            moving,
-            request.settings,
-            reference_mask=masks["reference"],
-            moving_mask=masks["moving"],
-            progress=progress,
-        )
-        for survey in (reference, moving):
-            unchanged(survey)
-        registration = dataclasses.replace(
-            with_frames(registration, reference, moving),
-            notes=(*registration.notes, *notes),
-            seconds={"read": reading, **registration.seconds},
-        )
-        _log_result(registration)
-        progress("write", 0.0)
-        write_record_files(registration, folder, reference=reference, moving=moving)
-        progress("figures", 0.0)
-        draw_figures(registration, folder / "figures")
-        progress("figures", 1.0)
+    _log_start(request)
+    clock = time.perf_counter()
+    progress("read", 0.0)
+    reference = read(request.reference, "reference")
+    progress("read", 0.5)
+    moving = read(request.moving, "moving")
+    notes = []
+    if same := same_files(reference, moving):
+        notes.append(same)
+    moving, crs_notes = common_crs(reference, moving)
+    notes += crs_notes
+    for note in notes:
+        LOG.warning("%s", note)
+    require_disk(folder, moving)
+    masks = read_masks(request.masks, reference.crs)
+    reading = time.perf_counter() - clock
+    registration = register_pair(
+        reference,
+        moving,
+        request.settings,
+        reference_mask=masks["reference"],
+        moving_mask=masks["moving"],
+        progress=progress,
+    )
+    for survey in (reference, moving):
+        unchanged(survey)
+    registration = dataclasses.replace(
+        with_frames(registration, reference, moving),
+        notes=(*registration.notes, *notes),
+        seconds={"read": reading, **registration.seconds},
+    )
+    _log_result(registration)
+    progress("write", 0.0)
+    write_record_files(registration, folder, reference=reference, moving=moving)
+    progress("figures", 0.0)
+    draw_figures(registration, folder / "figures")
+    progress("figures", 1.0)
     return registration
 
 
@@ -96,7 +99,7 @@ def _log_start(request: RegisterRequest) -> None:
     from meshreg import __version__
 
     LOG.info("meshreg %s, Python %s, %s", __version__, sys.version.split()[0], sys.platform)
-    LOG.info("register %s %s -o %s", request.reference.path, request.moving.path, request.out)
+    LOG.info("register %s %s -o %s", request.reference.name, request.moving.name, request.out)
     LOG.info("settings %s", request.settings.as_dict())
 
 
@@ -111,16 +114,3 @@ def _log_result(registration: Registration) -> None:
     if registration.transform is not None:
         LOG.info("offset (east, north, up) [m]: %s", registration.transform.offset.tolist())
     LOG.info("%s: %s", registration.verdict, registration.reason)
-
-
-def demo_request(out: Path, overwrite: bool) -> RegisterRequest:
-    """Return the main job on the pair of surveys that the package carries."""
-    from meshreg.io.options import ReadOptions
-
-    return RegisterRequest(
-        SurveyRequest(str(DEMO / "beach_2018.obj"), ReadOptions()),
-        SurveyRequest(str(DEMO / "beach_2019.obj"), ReadOptions()),
-        out,
-        settings=Settings().changed({"search.radius": 20.0}),
-        overwrite=overwrite,
-    )

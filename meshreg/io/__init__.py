@@ -197,23 +197,28 @@ def rewrite_survey(
 
 
 def unchanged(survey: Survey) -> None:
-    """Make sure that a survey's files are still those that were read.
+    """Make sure that a survey's files, and those they refer to, are still those that were read.
 
     Raises
     ------
     InputError
-        A file's size or time of change differs, and so does its checksum.
+        A file is gone, or sizes or times of change differ, and so does the checksum of a file
+        that stands alone.
     """
     from meshreg.io.safe import fingerprint, sha256
 
     for source in survey.source:
-        if not source.sha256 or not source.path.is_file():
-            if source.sha256 and not source.path.exists():
-                raise InputError("has gone since it was read.", file=source.path)
+        if not source.sha256:
             continue
-        if fingerprint(source.path) != source.fingerprint and sha256(source.path) != source.sha256:
+        for path in (source.path, *source.companions):
+            if not path.exists():
+                raise InputError("has gone since it was read.", file=path)
+        if fingerprint(source.path, source.companions) == source.fingerprint:
+            continue
+        if source.companions or sha256(source.path) != source.sha256:
+            what = "it, or a file that it names, " if source.companions else ""
             raise InputError(
-                "has changed since it was read.",
+                f"{what}has changed since it was read.",
                 file=source.path,
                 remedy="Run again when nothing writes to it.",
             )

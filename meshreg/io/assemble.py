@@ -115,7 +115,7 @@ def assemble_survey(path: Path, raw: RawGeometry, found: Found, options: ReadOpt
         companions=found.companions,
         sidecar=placed.sidecar,
         sha256=found.sha256 or sha256(path),
-        fingerprint=fingerprint(path),
+        fingerprint=fingerprint(path, found.companions),
         counts=found.counts,
     )
     return Survey(

@@ -221,7 +221,8 @@ def read_block(block: Block, options: ReadOptions) -> Survey:
 def _recorded(source: SourceFile) -> SourceFile:
     if not source.path.is_file() or (source.sha256 and source.fingerprint != (0, 0)):
         return source
-    return replace(source, sha256=sha256(source.path), fingerprint=fingerprint(source.path))
+    mark = fingerprint(source.path, source.companions)
+    return replace(source, sha256=sha256(source.path), fingerprint=mark)
 
 
 def rewrite(
@@ -241,7 +242,7 @@ def rewrite(
     for source in survey.source:
         target = registered_frame(home or source, source, centre=centre)
         start = source.frame
-        if start.crs is not None and start.crs != survey.crs:
+        if start.crs is not None and survey.crs is not None and start.crs != survey.crs:
             start = replace(start, crs=survey.crs)
         local = to_file(start, survey.centre[None])[0]
         mover = make_mover(source, transform, target, centre=local)

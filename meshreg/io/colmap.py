@@ -96,7 +96,8 @@ def read(path: Path, options: ReadOptions) -> Survey:
         frame=placed.frame,
         sidecar=placed.sidecar,
         sha256=_checksum(files),
-        fingerprint=_newest(files),
+        companions=files.paths,
+        fingerprint=fingerprint(files.folder, files.paths),
         counts={"points": len(model.points), "images": len(model.names)},
     )
     return Survey(
@@ -289,11 +290,6 @@ def _checksum(files: ModelFiles) -> str:
     return digest.hexdigest()
 
 
-def _newest(files: ModelFiles) -> tuple[int, int]:
-    marks = [fingerprint(path) for path in files.paths]
-    return sum(size for size, _ in marks), max(time for _, time in marks)
-
-
 def rewrite(source: SourceFile, move: Mover, path: Path) -> tuple[Path, ...]:
     """Write a moved copy of a COLMAP model, in the kind (.bin or .txt) that was read.
 
@@ -316,7 +312,7 @@ def rewrite(source: SourceFile, move: Mover, path: Path) -> tuple[Path, ...]:
     import pycolmap
 
     files = find_model(source.path)
-    if source.fingerprint != (0, 0) and _newest(files) != source.fingerprint:
+    if source.fingerprint not in ((0, 0), fingerprint(files.folder, files.paths)):
         raise InputError("has changed since it was read.", file=source.path)
     before, model = read_model(files)
     linear, shift = move.matrix[:3, :3], move.matrix[:3, 3]

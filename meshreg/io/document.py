@@ -71,6 +71,7 @@ def _estimate_document(estimate: OffsetEstimate) -> dict[str, Any]:
     found = math.isfinite(estimate.east) and math.isfinite(estimate.north)
     sigma = None if estimate.sigma is None else np.sqrt(np.diag(estimate.sigma)).tolist()
     return {
+        **({"manual": True} if estimate.manual else {}),
         "status": estimate.status,
         "offset": [estimate.east, estimate.north] if found else None,
         "sigma": sigma,
@@ -287,4 +288,5 @@ def _estimate(item: tuple[str, Mapping[str, Any]], path: Path) -> OffsetEstimate
         gap=_number(values["gap"]),
         overlap=_number(values["overlap"]),
         seconds=_number(values["seconds"]),
+        manual=bool(values.get("manual", False)),
     )

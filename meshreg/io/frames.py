@@ -223,8 +223,8 @@ def common_crs(reference: Survey, moving: Survey) -> tuple[Survey, tuple[str, ..
     Returns
     -------
     moving : Survey
-        Reframed where both CRS are known and differ; else as it came. Where one is missing, the
-        numbers of both are taken as one local frame.
+        Reframed where both CRS are known and differ. Where one is missing, the numbers of both are
+        taken as one local frame, which has the reference's CRS, or none.
     notes : tuple of str
     """
     if reference.crs == moving.crs:
@@ -237,7 +237,20 @@ def common_crs(reference: Survey, moving: Survey) -> tuple[Survey, tuple[str, ..
         f"{known.name!r} is in {crs_name(known.crs)}, {other.name!r} in a local frame without "
         "CRS: their coordinates are taken as one local frame. "
     )
-    return moving, (note + _grid_note(known),)
+    return _labelled(moving, reference.crs), (note + _grid_note(known),)
+
+
+def _labelled(survey: Survey, crs: str | None) -> Survey:
+    """Return a survey whose numbers are said to be in `crs`; none of them changes."""
+    geometry = survey.geometry
+    if isinstance(geometry, Maps):
+        color_grid = geometry.color_grid
+        geometry = replace(
+            geometry,
+            height_grid=replace(geometry.height_grid, crs=crs),
+            color_grid=None if color_grid is None else replace(color_grid, crs=crs),
+        )
+    return replace(survey, geometry=geometry, crs=crs)
 
 
 def _grid_note(survey: Survey) -> str:

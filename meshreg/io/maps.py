@@ -140,7 +140,7 @@ def _source(
         companions=companions,
         sidecar=None if sidecar is None else sidecar.path,
         sha256=sha256(raw.path),
-        fingerprint=fingerprint(raw.path),
+        fingerprint=fingerprint(raw.path, companions),
         counts={"rows": rows, "cols": cols, "valid": int(np.count_nonzero(raw.valid))},
     )
 

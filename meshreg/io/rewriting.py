@@ -26,11 +26,12 @@ def require_unchanged(source: SourceFile, path: Path) -> None:
     UsageError
         `path` is the source.
     InputError
-        Size or time of the source differ from those when it was read.
+        Size or time of the source, or of a file that it refers to, differ from those when it was
+        read.
     """
     if path.exists() and path.samefile(source.path):
         raise UsageError("would be overwritten by itself.", file=path, remedy="Choose another.")
-    if source.fingerprint != (0, 0) and fingerprint(source.path) != source.fingerprint:
+    if source.fingerprint not in ((0, 0), fingerprint(source.path, source.companions)):
         raise InputError(
             "has changed since it was read.", file=source.path, remedy="Start the run again."
         )

@@ -13,6 +13,7 @@ import re
 import shutil
 import stat
 import unicodedata
+from collections.abc import Sequence
 from pathlib import Path
 from typing import BinaryIO
 
@@ -244,11 +245,18 @@ def sha256(path: Path) -> str:
         return hashlib.file_digest(stream, "sha256").hexdigest()  # type: ignore[arg-type]
 
 
-def fingerprint(path: Path) -> tuple[int, int]:
-    """Return size [bytes] and time of last change [ns], to notice that a file has changed."""
-    with open_regular(path) as stream:
-        status = os.fstat(stream.fileno())
-    return status.st_size, status.st_mtime_ns
+def fingerprint(path: Path, companions: Sequence[Path] = ()) -> tuple[int, int]:
+    """Return size [bytes] and time of last change [ns], to notice that a file has changed.
+
+    With companions (texture pages, the files of a model whose `path` is their folder): the sums
+    over all files.
+    """
+    size = time = 0
+    for each in (*companions,) if os.path.isdir(path) and companions else (path, *companions):
+        with open_regular(each) as stream:
+            status = os.fstat(stream.fileno())
+        size, time = size + status.st_size, time + status.st_mtime_ns
+    return size, time
 
 
 def copy_file(source: Path, target: Path) -> None:

@@ -369,7 +369,10 @@ def test_a_missing_crs_is_local_and_said_with_scale_and_convergence():
     scale, convergence = grid_scale_and_convergence("EPSG:32754", *BEACH[:2])
     for reference, moving in ((utm_survey, local), (local, utm_survey)):
         moved, (note,) = common_crs(reference, moving)
-        assert moved is moving
+        assert moved.crs == reference.crs  # the numbers stay, and no stage sees two frames
+        assert moved.geometry is moving.geometry
+        assert (moved.origin == moving.origin).all()
+        assert moved.source[0].frame is moving.source[0].frame
         assert "'2019' in a local frame" in note
         assert f"{scale:.6f}" in note
         assert f"{np.degrees(convergence):+.3f} degrees" in note

@@ -402,6 +402,37 @@ def test_a_file_that_changes_while_it_is_read_is_noticed(tmp_path, monkeypatch):
         read_survey(path)
 
 
+@pytest.mark.parametrize("kind", ["material", "page", "model", "orthomosaic", "block"])
+def test_a_file_that_belongs_to_a_survey_is_noticed_too(tmp_path, kind):
+    if kind in ("material", "page"):
+        path = tmp_path / "reef.obj"
+        path.write_text("mtllib a.mtl\nusemtl m\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nf 1/1 2/1 3/1\n")
+        (tmp_path / "a.mtl").write_text("newmtl m\nmap_Kd a.png\n")
+        Image.new("RGB", (4, 4), (1, 2, 3)).save(tmp_path / "a.png")
+        other = tmp_path / ("a.mtl" if kind == "material" else "a.png")
+    elif kind == "model":
+        path = tmp_path / "model"
+        shutil.copytree(DATA / "colmap", path)
+        other = path / "images.bin"
+    elif kind == "orthomosaic":
+        for name in ("dsm", "ortho"):
+            shutil.copy(DATA / f"beach/20180601_{name}.tif", tmp_path / f"{name}.tif")
+        path, other = f"{tmp_path}/dsm.tif,{tmp_path}/ortho.tif", tmp_path / "ortho.tif"
+    else:
+        ply(tmp_path / "a.ply")
+        other = ply(tmp_path / "b.ply", shift=(9, 0, 0))
+        path = f"{tmp_path}/*.ply"
+    survey = read_survey(path)
+    unchanged(survey)
+    content = other.read_bytes()
+    other.write_bytes(content + b" ")
+    with pytest.raises(InputError, match="changed since it was read"):
+        unchanged(survey)
+    other.unlink()
+    with pytest.raises(InputError, match=rf"{re.escape(other.name)}: has gone"):
+        unchanged(survey)
+
+
 def test_a_survey_made_in_memory_never_changes():
     unchanged(Survey("made", PointCloud(SQUARE)))
 
