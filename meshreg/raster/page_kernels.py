@@ -11,20 +11,26 @@ from meshreg.raster.shade_kernels import SEEN, UInt32
 from meshreg.types import Float32, Float64, Int32, UInt8
 
 
-@jit(nogil=True)
+@jit(parallel=True, nogil=True)
 def page_spans(uv: Float32, face_page: Int32, n_pages: int) -> Float64:
     """Return the lowest and highest (u, v) on each page, (P, 2, 2); infinite where unused."""
-    spans = np.empty((n_pages, 2, 2), np.float64)
-    spans[:, 0] = np.inf
-    spans[:, 1] = -np.inf
-    for f in range(face_page.shape[0]):
-        page = face_page[f]
-        if page >= 0:
-            for corner in range(3):
-                for k in range(2):
-                    value = uv[f, corner, k]
-                    spans[page, 0, k] = min(spans[page, 0, k], value)
-                    spans[page, 1, k] = max(spans[page, 1, k], value)
+    n_faces, n_parts = face_page.shape[0], 16
+    parts = np.empty((n_parts, n_pages, 2, 2), np.float64)
+    parts[:, :, 0] = np.inf
+    parts[:, :, 1] = -np.inf
+    for part in prange(n_parts):
+        for f in range(part * n_faces // n_parts, (part + 1) * n_faces // n_parts):
+            page = face_page[f]
+            if page >= 0:
+                for corner in range(3):
+                    for k in range(2):
+                        value = uv[f, corner, k]
+                        parts[part, page, 0, k] = min(parts[part, page, 0, k], value)
+                        parts[part, page, 1, k] = max(parts[part, page, 1, k], value)
+    spans = parts[0].copy()
+    for part in range(1, n_parts):
+        spans[:, 0] = np.minimum(spans[:, 0], parts[part, :, 0])
+        spans[:, 1] = np.maximum(spans[:, 1], parts[part, :, 1])
     return spans
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from meshreg.errors import InputError
 from meshreg.types import Float64, Maps, Mesh, PointCloud, Survey, Transform
 
-_SAMPLE = 200_000  # faces or points looked at; every n-th, so that the answer is repeatable
+_SAMPLE = 50_000  # faces or points looked at; every n-th, so that the answer is repeatable
 
 
 @dataclass(frozen=True)

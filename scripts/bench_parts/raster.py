@@ -89,7 +89,7 @@ def looked_up(image: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
     return (upper * (1 - fy) + lower * fy + 0.5).astype(np.uint8)
 
 
-def row(work: str, tool: str, call: Callable[[], Any], times: int = 3) -> tuple[dict, Any]:
+def row(work: str, tool: str, call: Callable[[], Any], times: int = 5) -> tuple[dict, Any]:
     """Least wall time [s] and highest rise of memory [MB] of a few runs, and the last result."""
     results: list[Any] = []
 
@@ -132,7 +132,7 @@ def bench(
             work,
             "Open3D RaycastingScene + NumPy",
             partial(by_open3d, mesh, grid),
-            times=2,
+            times=3,
         )
         layers = draw_mesh(mesh, placing, grid, spacing, plain, times=1)
         off = np.abs(height - layers.height - placing.datum)
