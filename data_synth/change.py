@@ -27,10 +27,10 @@ class Change:
     """Strength of each class of change, 0 to 1.
 
     `bleaching`, `mortality`, `partial_mortality`, `breakage`, `boulders`, `mobile` are shares of
-    what could change; `growth` 1 is two years; `recruits` the share of new colonies; `turf` and
-    `sediment` about the share of the ground that is newly covered; `ripples` and `kelp` how far
-    from where they were; `texture` the part of the fine texture that is new. `sediment` also
-    raises or lowers the sand there is.
+    what could change; `growth` 1 is two years; `recruits` the share of new colonies; `turf` about
+    the share of the ground that is newly covered, `sediment` half as much of it, and the sand that
+    was there rises or falls and lies in other heaps; `ripples` and `kelp` how far from where they
+    were; `texture` the part of the fine texture, of the grit and of the rubble that is new.
     """
 
     growth: float = 0.0
@@ -156,9 +156,12 @@ def _move(
 
 def _new_ground(ground: t.Ground, seed: int, change: Change) -> t.Ground:
     draws = uniform(np.arange(4), 32, seed)
-    # sand comes or goes by up to 6 cm, which moves its shores
+    # at 1 the sand rises or falls by up to a decimetre and lies in other heaps, so that its shores
+    # move
+    rise = math.copysign(0.05 + 0.05 * abs(2.0 * draws[3] - 1.0), draws[3] - 0.5)
     return ground._replace(
-        sand_level=ground.sand_level + 0.06 * change.sediment * (2.0 * draws[3] - 1.0),
+        sand_level=ground.sand_level + rise * change.sediment,
+        drift=0.12 * change.sediment,
         ripple_phase=ground.ripple_phase
         + change.ripples * (0.35 + 0.3 * draws[0] + 3.0 * draws[1]),
         ripple_turn=ground.ripple_turn + change.ripples * 0.5 * (draws[2] - 0.5),
@@ -184,7 +187,10 @@ def _additions(before: Seafloor, site: Site, seed: int, change: Change) -> Rows:
             set_reach(some)
             some["z"], sandy = evaluate_ground(x, y, before.ground, 0.10)
             rows.append(some[sandy < 0.3])
-    for kind, strength, tall in ((t.SEDIMENT, change.sediment, 0.03), (t.TURF, change.turf, 0.010)):
+    for kind, strength, tall in (
+        (t.SEDIMENT, 0.5 * change.sediment, 0.03),
+        (t.TURF, change.turf, 0.010),
+    ):
         if strength > 0:
             ids, x, y = candidates(kind, 0.9 * strength, wide, seed, layer=1)
             some = np.zeros(len(ids), t.FEATURE)

@@ -57,6 +57,8 @@ def sand_height(x, y, ground, finest):
     """Height of the sand sheet [m] and the ripples' phase: 0 in the trough, 1 on the crest."""
     z = np.full(x.size, ground.sand_level)
     octaves_into(x, y, ground.seed + 11, 5.0, finest, 0.5, 3, ground.sand_relief, z)
+    if ground.drift > 0.0:
+        octaves_into(x, y, ground.mix_seed + 15, 1.6, finest, 0.5, 2, ground.drift, z)
     crest = np.full(x.size, 0.5)
     long = ground.ripple_wavelength
     if ground.ripple <= 0.0 or long <= finest:
@@ -108,8 +110,9 @@ def rock_height(x, y, ground, finest):
         for i in range(n):
             z[i] += tall * rough[i] * up[i]
         if k >= 1:
+            share = 0.6 if k == 1 else 0.6 * min(1.0, ground.fine)
             for i in range(n):
-                there = 0.6 if up[i] > 0.0 else 0.0
+                there = share if up[i] > 0.0 else 0.0
                 shade[i] += there * (_epoch_number(own[i], ground) - shade[i])
         if k == 1:  # some ground is smooth, some broken
             calm = _noise(x, y, ground.seed + 7, 1.6, finest, 0.6, 3)
@@ -153,7 +156,7 @@ def _rubble(x, y, wx, wy, ground, finest, z, shade):
                 lumps_into(wx, wy, size, 0.3 * k, seed, 0.95 * share, up, own)
                 for i in range(n):
                     z[i] += cover[i] * 0.28 * size * up[i]
-                    there = cover[i] if up[i] > 0.0 else 0.0
+                    there = min(1.0, ground.fine) * cover[i] if up[i] > 0.0 else 0.0
                     shade[i] += there * (own[i] - shade[i])
     return cover
 
@@ -166,7 +169,9 @@ def ground_block(x, y, ground, finest):
     if ground.sand_level < -1e8:
         return z, sandy, crest, shade, cover
     # no need to ask for the sand where all rock stands well above it
-    highest = ground.sand_level + 8.0 * ground.sand_relief + ground.ripple + 0.03
+    highest = (
+        ground.sand_level + 8.0 * ground.sand_relief + 6.0 * ground.drift + ground.ripple + 0.03
+    )
     lowest = z[0]
     for i in range(x.size):
         lowest = min(lowest, z[i])
@@ -183,8 +188,8 @@ def ground_block(x, y, ground, finest):
 def rock_color(x, y, ground, shade, cover, finest, out):
     """Put the reflectance of rock, turf, coralline crust and rubble into `out` (N, 3)."""
     n = x.size
-    zone = _noise(x, y, ground.seed + 50, 1.3, finest, 0.6, 2)
-    patch = _mixed(x, y, ground, 51, 0.35, finest, 0.7, 4)
+    zone = _noise(x, y, ground.seed + 50, 1.3, finest, 0.7, 2)
+    patch = _mixed(x, y, ground, 51, 0.35, finest, 0.6, 4)
     fine = _mixed(x, y, ground, 52, 0.055, finest, 0.7, 3)
     grain = _mixed(x, y, ground, 53, 0.010, finest, 0.7, 2)
     # crusts of sponge, bryozoans, barnacles, holes
@@ -198,7 +203,7 @@ def rock_color(x, y, ground, shade, cover, finest, out):
         spot = blots[i]
         f, g, spot = ground.fine * f, ground.fine * g, ground.fine * spot
         wide = ground.patch * zone[i]
-        tone = max(0.25, 1.0 + 0.10 * wide + 0.16 * p + 0.20 * f + 0.09 * g + 0.55 * spot)
+        tone = max(0.25, 1.0 + 0.20 * wide + 0.16 * p + 0.20 * f + 0.09 * g + 0.55 * spot)
         # bare limestone or basalt
         low = 0.19 * (0.45 + 1.05 * h) * tone
         red, green = low * ground.tone_red, low * ground.tone_green
@@ -213,8 +218,8 @@ def rock_color(x, y, ground, shade, cover, finest, out):
         blue += t * (low * (0.50 - 0.12 * hue) - blue)
         # coralline algae: mauve and pink crusts with sharp borders
         t = 0.5 * zone[i] - 0.55 * p + 0.45 * f + 0.4 * (h - 0.5)
-        t = ground.coralline * smoothstep(0.55, 0.8, t)
-        low = 0.20 * (1.0 + 0.18 * f + 0.08 * g)
+        t = ground.coralline * smoothstep(0.45, 0.9, t)
+        low = 0.15 * (1.0 + 0.18 * f + 0.08 * g)
         red += t * (low * 1.15 - red)
         green += t * (low * 0.72 - green)
         blue += t * (low * 0.82 - blue)

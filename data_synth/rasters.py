@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -98,7 +98,9 @@ def _sampled(take: Take, snap: float, step: float) -> Sampled:
     lattice = Lattice(
         left * snap - start[0] + step / 2, high * snap - start[1] - step / 2, step, shape
     )
-    view = take.sample(lattice)
+    # a sample stands for the square around it: softened as the mean over that square would be
+    seeing = replace(take.seeing, blur=math.hypot(take.seeing.blur, 0.6 * step))
+    view = replace(take, seeing=seeing).sample(lattice)
     kept = take.margin_lattice(lattice) > 0
     up = view.up
     sigma = take.sfm.smoothing * take.sfm.mesh_spacing / step

@@ -45,7 +45,7 @@ class Site:
     rubble: float = 0.3
     turf: float = 0.8
     coralline: float = 0.5
-    patch: float = 1.0
+    patch: float = 3.0
     fine: float = 1.0
     tone: tuple[float, float, float] = (1.0, 0.88, 0.68)
     sand_tone: tuple[float, float, float] = (0.46, 0.41, 0.31)
@@ -110,6 +110,7 @@ def bare_ground(site: Site, seed: int) -> t.Ground:
         sand_red=site.sand_tone[0],
         sand_green=site.sand_tone[1],
         sand_blue=site.sand_tone[2],
+        drift=0.0,
         mix=0.0,
         mix_seed=0,
     )
@@ -275,8 +276,9 @@ SITES: dict[str, Site] = {
         sand_tone=(0.36, 0.33, 0.27),
         coralline=0.45,
         rubble=0.35,
+        fine=0.5,
     ),
-    "reef_and_sand": replace(Site(), sand=0.45, step=0.35, step_level=0.3, massive=0.9),
+    "reef_and_sand": replace(Site(), sand=0.45, step=0.35, step_level=0.3, massive=0.9, fine=2.0),
     "sand": replace(
         Site(),
         relief=0.02,

@@ -19,32 +19,34 @@ UInt8 = NDArray[np.uint8]
 class Seeing:
     """Light, water and cameras of one survey. Lengths in metres, angles in degrees.
 
-    `sun` and `ambient` are daylight, `strobe` the vehicle's lamps. `attenuation` is per metre of
-    water for red, green and blue; `corrected` the share of the mean loss that was removed by the
-    operator; `cast` multiplies the channels afterwards. `seams` is the spread of exposure between
-    neighbouring images, `noise` the sensor's in grey values, `blur` a sigma on the ground.
+    `sun` and `strobe` (the vehicle's lamps) come from one side, `ambient` from all: daylight, and
+    what is left of the lamps where a texture blends several images and its light was evened out.
+    `attenuation` is per metre of water for red, green and blue; `corrected` the share of the mean
+    loss that was removed by the operator; `cast` multiplies the channels afterwards. `seams` is
+    the spread of exposure between neighbouring images, `noise` the sensor's in grey values,
+    `blur` a sigma on the ground.
     """
 
     altitude: float = 2.0
-    sun: float = 0.25
+    sun: float = 0.15
     sun_azimuth: Drawn = (0.0, 360.0)
     sun_elevation: Drawn = (50.0, 80.0)
-    ambient: float = 0.35
-    strobe: float = 0.7
+    ambient: float = 0.9
+    strobe: float = 0.25
     strobe_arm: float = 0.6
     strobe_balance: float = 0.6
-    crevice: float = 8.0  # dimming per metre below the surroundings
+    crevice: float = 3.0  # dimming per metre below the surroundings
     attenuation: tuple[float, float, float] = (0.40, 0.09, 0.06)
-    haze: tuple[float, float, float] = (0.01, 0.05, 0.07)
+    haze: tuple[float, float, float] = (0.10, 0.14, 0.14)
     corrected: float = 0.9
     cast: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    exposure: float = 0.20  # mean linear brightness of the mosaic
+    exposure: float = 0.07  # mean linear brightness of the mosaic
     gamma: float = 2.2
     vignette: float = 0.2
     seams: float = 0.04
     caustics: float = 0.0
     particles: float = 0.5  # per square metre
-    noise: float = 1.0
+    noise: float = 0.5
     blur: float = 0.004
     heading: Drawn = (0.0, 180.0)
     track_spacing: float = 1.0

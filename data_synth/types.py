@@ -80,5 +80,6 @@ class Ground(NamedTuple):
     sand_red: float
     sand_green: float
     sand_blue: float
+    drift: float  # standard deviation of the height of sand that came or went [m]
     mix: float  # share of the texture that is the epoch's own, 0..1
     mix_seed: int

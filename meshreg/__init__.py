@@ -17,6 +17,7 @@ _HOMES = {
     "estimate_offset": "meshreg.offsets",
     "estimate_offsets": "meshreg.offsets",
     "register_pair": "meshreg.pipeline",
+    "self_test": "meshreg.selftest",
     "apply_transform": "meshreg.apply",
     "write_survey": "meshreg.io",
     "write_registration": "meshreg.io",
@@ -29,6 +30,7 @@ _HOMES = {
     "Grid": "meshreg.types",
     "SurveyRaster": "meshreg.types",
     "Transform": "meshreg.types",
+    "Warp": "meshreg.types",
     "OffsetEstimate": "meshreg.types",
     "Registration": "meshreg.types",
     "MeshregError": "meshreg.errors",
@@ -48,6 +50,7 @@ if TYPE_CHECKING:
     from meshreg.offsets import estimate_offsets as estimate_offsets
     from meshreg.pipeline import register_pair as register_pair
     from meshreg.raster import rasterize as rasterize
+    from meshreg.selftest import self_test as self_test
     from meshreg.settings import Settings as Settings
     from meshreg.types import Grid as Grid
     from meshreg.types import Maps as Maps
@@ -58,6 +61,7 @@ if TYPE_CHECKING:
     from meshreg.types import Survey as Survey
     from meshreg.types import SurveyRaster as SurveyRaster
     from meshreg.types import Transform as Transform
+    from meshreg.types import Warp as Warp
 
 
 def __getattr__(name: str) -> Any:

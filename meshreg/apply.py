@@ -5,10 +5,12 @@ from __future__ import annotations
 import dataclasses
 
 from meshreg.errors import UsageError
-from meshreg.types import Maps, Mesh, PointCloud, Survey, Transform
+from meshreg.types import Maps, Mesh, PointCloud, Survey, Transform, Warp
 
 
-def apply_transform(survey: Survey, reference_from_moving: Transform) -> Survey:
+def apply_transform(
+    survey: Survey, reference_from_moving: Transform, warp: Warp | None = None
+) -> Survey:
     """Return the survey laid on the reference; the one given is untouched.
 
     Parameters
@@ -17,6 +19,8 @@ def apply_transform(survey: Survey, reference_from_moving: Transform) -> Survey:
         With a mesh or point cloud.
     reference_from_moving : Transform
         Acts on absolute coordinates [m].
+    warp : Warp, optional
+        Bends the survey where the transform has put it.
 
     Returns
     -------
@@ -38,6 +42,8 @@ def apply_transform(survey: Survey, reference_from_moving: Transform) -> Survey:
     # p -> linear p + (T(origin) - new origin): the rotation acts on small numbers only
     origin = reference_from_moving.apply(survey.origin)
     points = geometry.points @ reference_from_moving.linear.T
+    if warp is not None:
+        points = points + warp.displacement(points + origin)
     moved: Mesh | PointCloud
     if isinstance(geometry, Mesh):
         moved = dataclasses.replace(geometry, vertices=points)

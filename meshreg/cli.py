@@ -56,6 +56,17 @@ class Preset(StrEnum):
     paper = "paper"
 
 
+class WarpModel(StrEnum):
+    """How the moving survey may be bent after its rigid move."""
+
+    none = "none"
+    auto = "auto"
+    similarity = "similarity"
+    dome = "dome"
+    quadratic = "quadratic"
+    spline = "spline"
+
+
 _SHIFT = "Add to its coordinates in metres; replaces a sidecar's shift."
 OutOption = Annotated[Path, typer.Option("--out", "-o", help="Folder for the result.")]
 AxesOption = Annotated[Axes | None, typer.Option(help="Axes of the file(s): enu, or ned (ACFR).")]
@@ -127,11 +138,18 @@ def register(
         str | None, typer.Option(help="Some of sift,terrain,mutual_information.")
     ] = None,
     preset: Annotated[Preset | None, typer.Option(help="robust, or paper as published.")] = None,
+    warp: Annotated[
+        WarpModel | None,
+        typer.Option(help="Bend the moving survey too, where its tiles show it: none, or auto."),
+    ] = None,
     config: ConfigOption = None,
     changes: SetOption = None,
     seed: Annotated[int | None, typer.Option(help="Seed of every random draw; 0.")] = None,
     scale: ScaleOption = None,
     positions: PositionsOption = None,
+    ties: Annotated[
+        str | None, typer.Option(metavar="FILE", help="Points picked by hand, one more method.")
+    ] = None,
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
     debug: DebugOption = False,
@@ -158,6 +176,7 @@ def register(
             "raster.ortho_cell": ortho_cell,
             "raster.sift_cell": sift_cell,
             "methods": methods,
+            "warp.model": None if warp is None else str(warp),
             "seed": seed,
         },
     )
@@ -176,6 +195,7 @@ def register(
         tuple(mask or ()),
         settings,
         overwrite,
+        ties,
     )
     return _do_register(request, _voice(as_json))
 
@@ -193,6 +213,41 @@ def _do_register(request: Any, voice: Voice) -> int:
     else:
         result.show(registration, request.out, voice)
     return 0 if registration.verdict == "accepted" else 4
+
+
+@app.command()
+def report(
+    out: Annotated[Path, typer.Argument(help="Folder that `register` wrote.")],
+    as_json: JsonOption = False,
+    debug: DebugOption = False,
+) -> int:
+    """Make report.html of a result again, from what was saved in its folder."""
+    del debug
+    from meshreg.cli_parts import reporting
+    from meshreg.cli_parts.guard import run_stoppable
+
+    voice = _voice(as_json)
+    page = run_stoppable(lambda unfinished: reporting.write_report(out))
+    if as_json:
+        voice.document(reporting.document(page))
+    else:
+        reporting.show(page, voice)
+    return 0
+
+
+@app.command()
+def view(
+    out: Annotated[Path, typer.Argument(help="Folder that `register` wrote.")],
+    as_json: JsonOption = False,
+    debug: DebugOption = False,
+) -> int:
+    """Show both surfaces of a result in a window, to turn about."""
+    del as_json, debug
+    from meshreg.cli_parts import reporting
+    from meshreg.cli_parts.guard import run_stoppable
+
+    run_stoppable(lambda unfinished: reporting.view(out))
+    return 0
 
 
 @app.command()
@@ -372,6 +427,63 @@ def synth(
 
 
 @app.command()
+def selftest(
+    reference: Annotated[str, typer.Argument(help="Original survey: file, folder or quoted glob.")],
+    moving: Annotated[str, typer.Argument(help="Repeat survey, into which shifts are put.")],
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder for the result.")] = None,
+    count: Annotated[int, typer.Option("--shifts", help="How many shifts.")] = 8,
+    reference_shift: Annotated[str | None, typer.Option(metavar="E,N,U", help=_SHIFT)] = None,
+    moving_shift: Annotated[str | None, typer.Option(metavar="E,N,U", help=_SHIFT)] = None,
+    axes: AxesOption = None,
+    up: UpOption = None,
+    unit: UnitOption = None,
+    mask: MaskOption = None,
+    config: ConfigOption = None,
+    changes: SetOption = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of the shifts; 0.")] = None,
+    scale: ScaleOption = None,
+    positions: PositionsOption = None,
+    overwrite: OverwriteOption = False,
+    as_json: JsonOption = False,
+    debug: DebugOption = False,
+) -> int:
+    """Put known shifts into the MOVING survey, recover them blind, say what can be resolved.
+
+    Exit code 0: the pair itself is accepted; 4: review or rejected.
+    """
+    del debug
+    from meshreg.cli_parts import selftesting
+    from meshreg.cli_parts.common import SurveyRequest
+    from meshreg.cli_parts.guard import run_stoppable
+
+    settings = join_settings(None, config, changes, {"seed": seed})
+    scales, places = for_both("--scale", scale), for_both("--positions", positions)
+    shared = {"axes": axes, "up": up, "unit": unit}
+    options = [
+        read_options(shift, name, **shared, scale=scales[k], positions=places[k])
+        for k, (shift, name) in enumerate(
+            ((reference_shift, "--reference-shift"), (moving_shift, "--moving-shift"))
+        )
+    ]
+    request = selftesting.SelftestRequest(
+        SurveyRequest(reference, options[0]),
+        SurveyRequest(moving, options[1]),
+        out,
+        tuple(mask or ()),
+        settings,
+        count,
+        overwrite,
+    )
+    voice = _voice(as_json)
+    document = run_stoppable(lambda unfinished: selftesting.selftest(request, voice, unfinished))
+    if as_json:
+        voice.document(document)
+    else:
+        selftesting.show(document, voice)
+    return 0 if document["verdict"] == "accepted" else 4
+
+
+@app.command()
 def benchmark(
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for pairs, tables, page.")],
     scenarios: Annotated[
@@ -412,6 +524,97 @@ def benchmark(
     else:
         benchmarking.show(summary, out, voice)
     return 4 if summary["unmet"] else 0
+
+
+@app.command()
+def pick(
+    reference: Annotated[str, typer.Argument(help="Original survey, or a registration's folder.")],
+    moving: Annotated[str | None, typer.Argument(help="Repeat survey.")] = None,
+    ties: Annotated[Path, typer.Option("--out", "-o", help="The pairs, as CSV; resumed.")] = Path(
+        "ties.csv"
+    ),
+    registration: Annotated[
+        Path | None, typer.Option(metavar="OUT", help="Pan together by a registration.")
+    ] = None,
+    reference_shift: Annotated[str | None, typer.Option(metavar="E,N,U", help=_SHIFT)] = None,
+    moving_shift: Annotated[str | None, typer.Option(metavar="E,N,U", help=_SHIFT)] = None,
+    axes: AxesOption = None,
+    up: UpOption = None,
+    unit: UnitOption = None,
+    scale: ScaleOption = None,
+    positions: PositionsOption = None,
+    cell: Annotated[float | None, typer.Option(help="Cell of the pictures; from the data.")] = None,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="0 takes a free one.")] = 0,
+    browser: Annotated[bool, typer.Option("--browser", help="Open the page there.")] = False,
+    as_json: JsonOption = False,
+    debug: DebugOption = False,
+) -> int:
+    """Pick tie points by hand, on a page that this machine alone can open.
+
+    Give the two surveys as to `register`, or the folder that it wrote. Each pair is saved at once;
+    Ctrl-C ends, the same command goes on.
+    """
+    del debug
+    from meshreg.cli_parts import picking
+    from meshreg.cli_parts.common import SurveyRequest
+
+    if moving is None and registration is not None:
+        raise UsageError("--registration goes with two surveys; a folder has its own.")
+    scales, places = for_both("--scale", scale), for_both("--positions", positions)
+    shared = {"axes": axes, "up": up, "unit": unit}
+    surveys = [
+        SurveyRequest(
+            path,
+            read_options(shift, name, **shared, scale=scales[k], positions=places[k]),
+        )
+        for k, (path, shift, name) in enumerate(
+            (
+                (reference, reference_shift, "--reference-shift"),
+                (moving or "", moving_shift, "--moving-shift"),
+            )
+        )
+    ]
+    request = picking.PickRequest(
+        surveys[0], surveys[1] if moving else None, ties, registration, cell, port, browser
+    )
+    picking.pick(request, _voice(as_json))
+    return 0
+
+
+@app.command()
+def validate(
+    out: Annotated[Path, typer.Argument(help="Folder of a registration.")],
+    ties: Annotated[
+        str, typer.Argument(help="Pairs: ties.csv, Metashape or TagLab; or REFERENCE,MOVING files.")
+    ],
+    reference_ortho: Annotated[
+        Path | None, typer.Option(help="Orthomosaic that TagLab's pixels are of; OUT's own.")
+    ] = None,
+    moving_ortho: Annotated[
+        Path | None, typer.Option(help="The same of the moving survey as delivered.")
+    ] = None,
+    radius: Annotated[float, typer.Option(help="Pairs within this distance agree; metres.")] = 0.20,
+    seed: Annotated[int, typer.Option(help="Seed of the RANSAC.")] = 0,
+    as_json: JsonOption = False,
+    debug: DebugOption = False,
+) -> int:
+    """Hold a registration against points picked by hand. Exit code 4: they do not confirm it.
+
+    As in the paper: the pairs' own translation by RANSAC, their mean residual, and the distance of
+    each method's offset and of the result from it. Written to OUT/validation.json and .html.
+    """
+    del debug
+    from meshreg.cli_parts import validating
+    from meshreg.cli_parts.guard import run_stoppable
+
+    voice = _voice(as_json)
+    request = validating.ValidateRequest(out, ties, reference_ortho, moving_ortho, radius, seed)
+    document = run_stoppable(lambda unfinished: validating.validate(request))
+    if as_json:
+        voice.document(document)
+    else:
+        validating.show(document, out, voice)
+    return 0 if document["confirmed"] else 4
 
 
 def _voice(as_json: bool) -> Voice:

@@ -115,6 +115,7 @@ def judge(
     rasters: Mapping[str, tuple[SurveyRaster, SurveyRaster]],
     settings: Settings,
     radius: float,
+    trials: int = 1,
 ) -> Judgement:
     """Weigh the methods' candidates against the evidence of terrain and image.
 
@@ -126,6 +127,9 @@ def judge(
     settings : Settings
     radius : float
         Half width of the search window [m].
+    trials : int
+        How many turns and scales of the moving survey these rasters were chosen from: chance is
+        so many times more likely.
     """
     maps: dict[str, ChannelMap] = {}
     for channel, raster in (("terrain", "dem"), ("image", "ortho")):
@@ -139,7 +143,7 @@ def judge(
     hypotheses = tuple(sorted(_merge(candidates, maps, reach), key=lambda h: h.score, reverse=True))
     if not hypotheses:
         return Judgement("rejected", "no method found a candidate", None, maps=maps)
-    return _verdict(hypotheses, maps, settings.judge, radius, reach)
+    return _verdict(hypotheses, maps, settings.judge, radius, reach, trials)
 
 
 def agree_distance(settings: JudgeSettings, dem_cell: float) -> float:
@@ -292,9 +296,10 @@ def _verdict(
     settings: JudgeSettings,
     radius: float,
     reach: float,
+    trials: int,
 ) -> Judgement:
     best = hypotheses[0]
-    alarm = _false_alarm(best, maps, radius, reach)
+    alarm = min(1.0, trials * _false_alarm(best, maps, radius, reach))
 
     def say(verdict: Verdict, reason: str) -> Judgement:
         return Judgement(verdict, reason, best, hypotheses, alarm, maps)

@@ -3,7 +3,8 @@
 Bryson, Johnson-Roberson, Pizarro and Williams (IROS 2013) are followed section by section: both
 surveys are rasterized on one lattice, SIFT on the mosaics (III-B), the terrain scan (III-C) and
 mutual information (III-D) each propose an offset, and, beyond the paper, the proposals are judged
-by one neutral measure, refined on tiles, and given a verdict.
+by one neutral measure, refined on tiles, and given a verdict. A survey whose heading or scale is
+off by more than the methods bear is turned first, as its tiles vote.
 """
 
 from __future__ import annotations
@@ -21,23 +22,38 @@ import numpy as np
 from meshreg import judge as judging
 from meshreg import statistics
 from meshreg.errors import UsageError
+from meshreg.heading import (
+    Turned,
+    as_delivered,
+    on_heading_and_scale,
+    tile_scale,
+    turned_as_voted,
+    turning,
+)
+from meshreg.heights import Heights, fit_heights
 from meshreg.offsets import ESTIMATORS, estimate_offset, search_radius
 from meshreg.raster import rasterize
 from meshreg.raster.grid import choose_cells, coarsened, common_grid, survey_grid
 from meshreg.refine import Refined, refine
 from meshreg.settings import Settings
+from meshreg.surfaces import check_surfaces, polish
 from meshreg.types import (
     Float64,
     Grid,
+    Maps,
     OffsetEstimate,
     Registration,
     Survey,
     SurveyRaster,
     Transform,
 )
+from meshreg.voting import Turn, vote
+from meshreg.warp import Internal, check_model, measure
+from meshreg.warp_rasters import warped_raster
 
 log = logging.getLogger(__name__)
 Progress = Callable[[str, float], None]
+Manual = Callable[[Transform | None], OffsetEstimate]
 Pairs = dict[str, tuple[SurveyRaster, SurveyRaster]]
 
 
@@ -48,6 +64,7 @@ def register_pair(
     *,
     reference_mask: Any = None,
     moving_mask: Any = None,
+    manual: Manual | None = None,
     progress: Progress | None = None,
 ) -> Registration:
     """Lay the moving (repeat) survey on the reference (original) one, and say how sure that is.
@@ -59,6 +76,9 @@ def register_pair(
     settings : Settings, optional
     reference_mask, moving_mask : callable, optional
         What to use of each survey (`meshreg.io.masks.read_mask`).
+    manual : callable, optional
+        ``manual(motion)`` is a person's proposal (`meshreg.ties.ties_estimate`), of the moving
+        survey as `motion` turned it first, if that is not None. It is judged like the methods'.
     progress : callable, optional
         Called with a stage's name and the fraction of it that is done.
 
@@ -73,37 +93,47 @@ def register_pair(
         If the surveys' CRS differ, or only one of them has a known scale.
     """
     settings = settings or Settings()
-    _check(reference, moving, settings)
+    settings, radius, notes = prepared(reference, moving, settings)
     tell = progress or (lambda stage, fraction: None)
     clock = _Clock(tell)
-    cells = choose_cells(reference, moving, settings.raster)
-    radius = search_radius(settings, cells.dem)
-    settings = settings.changed(
-        {
-            "search.radius": radius,
-            "raster.dem_cell": cells.dem,
-            "raster.ortho_cell": cells.ortho,
-            "raster.sift_cell": cells.sift,
-        }
-    )
-    notes = [*cells.notes]
     masks = {"reference": reference_mask, "moving": moving_mask}
-    away = _gap_between(reference, moving)
-    if away > radius:
-        return _too_far(reference, moving, settings, away, clock.seconds, notes)
+    if apart := surveys_apart(reference, moving, radius):
+        return _too_far(reference, moving, settings, apart, clock.seconds, notes)
     with clock.stage("rasterize"):
-        pairs = _rasterize(reference, moving, settings, masks, tell)
-    decision = decide(pairs, settings, radius, tell)
+        pairs = rasterize_pair(reference, moving, settings, masks, tell)
+
+    def turned(turn: Turn) -> tuple[Pairs, Transform]:
+        motion = turning(turn, moving.centre)
+        return rasterize_pair(reference, moving, settings, masks, tell, motion, pairs), motion
+
+    decision = decide(pairs, settings, radius, tell, manual, turned)
     clock.seconds.update(decision.seconds)
+    notes += decision.notes
     judgement, refined = decision.judgement, decision.refined
-    notes += [refined.note] if refined is not None and refined.note else []
+    if isinstance(moving.geometry, Maps) and decision.heights is not None:
+        decision = dataclasses.replace(decision, heights=decision.heights.levelled())
+    notes += [part.note for part in (refined, decision.heights) if part is not None and part.note]
+    transform, covariance, error = completed(moving, decision)
+    if (
+        transform is not None
+        and decision.heights is not None
+        and settings.refine.surfaces != "none"
+    ):
+        with clock.stage("surfaces"):
+            said = polish(
+                reference, moving, transform, decision.heights.place, error, settings.seed
+            )
+        transform, notes = said.transform, [*notes, said.note]
     with clock.stage("apply"):
-        transform, up_sigma, rasters = _lay_down(reference, moving, refined, settings, masks, pairs)
+        rasters = _lay_down(moving, transform, settings, masks, pairs)
+    with clock.stage("internal"):
+        internal, rasters = _internal(refined, transform, rasters, settings)
+    notes += [internal.said] if internal.said else []
     return Registration(
         verdict=judgement.verdict,
         reason=judgement.reason,
         transform=transform,
-        covariance=None if refined is None else _covariance(refined, up_sigma, transform),
+        covariance=covariance,
         estimates=decision.estimates,
         hypotheses=tuple(_plain(h) for h in judgement.hypotheses[:5]),
         before=statistics.compare(
@@ -126,9 +156,12 @@ def register_pair(
         versions=versions(),
         seconds=clock.seconds,
         notes=tuple(notes),
+        registration_error=error,
+        internal=internal.record or None,
+        warp=internal.warp,
         evidence=rasters
         | {
-            "residuals": _residuals(refined),
+            "residuals": internal.evidence or _residuals(refined),
             "channels": judgement.maps,
             "false_alarm": judgement.false_alarm,
             "masked": {
@@ -139,9 +172,27 @@ def register_pair(
     )
 
 
+def prepared(
+    reference: Survey, moving: Survey, settings: Settings
+) -> tuple[Settings, float, list[str]]:
+    """Check the call; return the settings with cells and radius filled in, the radius, notes."""
+    _check(reference, moving, settings)
+    cells = choose_cells(reference, moving, settings.raster)
+    radius = search_radius(settings, cells.dem)
+    settings = settings.changed(
+        {
+            "search.radius": radius,
+            "raster.dem_cell": cells.dem,
+            "raster.ortho_cell": cells.ortho,
+            "raster.sift_cell": cells.sift,
+        }
+    )
+    return settings, radius, list(cells.notes)
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class Decision:
-    """What a pair of rasters says, before the transform is completed by its height.
+    """What a pair of rasters says.
 
     Attributes
     ----------
@@ -149,19 +200,44 @@ class Decision:
     judgement : Judgement
         With the doubts of the refinement in its verdict.
     refined : Refined or None
-        None when rejected.
+        From the moving survey as it was delivered; None when rejected.
     seconds : mapping
-        By stage: each method, "judge", "refine".
+        By stage: "vote", each method, "judge", "refine".
+    heights : Heights or None
+        None when rejected.
+    notes : tuple of str
+        What the user should know of the heading and the scale.
+    motion : Transform or None
+        By which the moving survey was turned before the methods looked at it: estimates,
+        hypotheses and channel maps are those of the turned one.
+    scale : float
+        By which lengths are multiplied; 1 unless asked for or plainly wrong.
     """
 
     estimates: tuple[OffsetEstimate, ...]
     judgement: judging.Judgement
     refined: Refined | None
     seconds: Mapping[str, float]
+    heights: Heights | None = None
+    notes: tuple[str, ...] = ()
+    motion: Transform | None = None
+    scale: float = 1.0
+
+    @property
+    def transform(self) -> Transform | None:
+        """The whole `reference_from_moving`; None when rejected."""
+        if self.refined is None or self.heights is None:
+            return None
+        return self.heights.transform(_horizontal(self.refined, self.scale))
 
 
 def decide(
-    pairs: Pairs, settings: Settings, radius: float, progress: Progress | None = None
+    pairs: Pairs,
+    settings: Settings,
+    radius: float,
+    progress: Progress | None = None,
+    manual: Manual | None = None,
+    turned: Turned | None = None,
 ) -> Decision:
     """Estimate, judge and refine: everything of `register_pair` that looks at rasters alone.
 
@@ -173,21 +249,77 @@ def decide(
     radius : float
         Half width of the search window [m].
     progress : callable, optional
+    manual : callable, optional
+        As of `register_pair`.
+    turned : callable, optional
+        ``turned(turn)`` makes the rasters of the turned moving survey again, and says by which
+        motion; without it a survey that needs turning is looked at as it is.
     """
     clock = _Clock(progress or (lambda stage, fraction: None))
-    estimates = []
+    turn = None
+    if settings.search.max_yaw > 0 or settings.search.max_scale > 0:
+        with clock.stage("vote"):
+            turn = vote(pairs, settings.search, radius)
+    if turn is not None and turn.needed and turned is not None:
+        log.info("the tiles vote for a turn: %s", turn)
+        with clock.stage("turn"):
+            again, motion = turned_as_voted(pairs, turn, turned, settings.search, radius)
+        decision = _in_frame(again, settings, radius, clock, manual, turn, (motion, pairs))
+        if decision.judgement.verdict != "rejected":
+            return decision
+    return _in_frame(pairs, settings, radius, clock, manual, turn)
+
+
+def _in_frame(
+    pairs: Pairs,
+    settings: Settings,
+    radius: float,
+    clock: _Clock,
+    manual: Manual | None,
+    turn: Turn | None,
+    delivered: tuple[Transform, Pairs] | None = None,
+) -> Decision:
+    """Estimate, judge and refine on rasters; of the turned survey, where `delivered` is given."""
+    motion, first = (None, pairs) if delivered is None else delivered
+    scale = 1.0
+    estimates: list[OffsetEstimate] = []
     for method in settings.methods:
         with clock.stage(method):
             estimates.append(estimate_offset(*pairs[ESTIMATORS[method].raster], method, settings))
             log.info("%s: %s %s", method, estimates[-1].status, estimates[-1].reason)
+    if manual is not None:
+        estimates.append(_within(radius, manual(motion)))
     with clock.stage("judge"):
-        judgement = judging.judge(estimates, pairs, settings, radius)
-    refined = None
+        trials = 1 if turn is None or motion is None else turn.trials
+        judgement = judging.judge(estimates, pairs, settings, radius, trials)
+    refined, heights = None, None
+    notes: tuple[str, ...] = ()
     if judgement.best is not None and judgement.verdict != "rejected":
         with clock.stage("refine"):
             refined = _refine(judgement, pairs, settings)
-            judgement = judgement.doubted(refined.doubt)
-    return Decision(tuple(estimates), judgement, refined, clock.seconds)
+            if settings.search.free_scale or (motion is not None and motion.scale != 1.0):
+                scale = tile_scale(refined)
+            if motion is not None:
+                refined, scale = as_delivered(refined, motion), scale * motion.scale
+            heights = fit_heights(*first["dem"], _horizontal(refined, scale))
+            judgement = judgement.doubted(refined.doubt).doubted(heights.doubt)
+        judgement, notes = on_heading_and_scale(
+            judgement, refined.yaw, scale, settings.search, turn
+        )
+    told = (notes, motion, scale)
+    return Decision(tuple(estimates), judgement, refined, clock.seconds, heights, *told)
+
+
+def _within(radius: float, estimate: OffsetEstimate) -> OffsetEstimate:
+    """Fail a proposal beyond the search window: nothing there can be judged."""
+    if max(abs(estimate.east), abs(estimate.north)) <= radius or estimate.status == "failed":
+        return estimate
+    where = f"({estimate.east:.2f}, {estimate.north:.2f}) m"
+    reason = f"the offset {where} is outside the search radius of {radius:g} m"
+    nan = float("nan")
+    return dataclasses.replace(
+        estimate, status="failed", reason=reason, east=nan, north=nan, sigma=None
+    )
 
 
 def versions() -> dict[str, str]:
@@ -223,11 +355,13 @@ class _Clock:
         self.tell(name, 0.0)
         started = time.perf_counter()
         yield
-        self.seconds[name] = time.perf_counter() - started
+        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - started
         self.tell(name, 1.0)
 
 
 def _check(reference: Survey, moving: Survey, settings: Settings) -> None:
+    check_model(settings.warp.model)
+    check_surfaces(settings.refine.surfaces)
     for method in settings.methods:
         if method not in ESTIMATORS:
             raise UsageError(
@@ -246,11 +380,17 @@ def _check(reference: Survey, moving: Survey, settings: Settings) -> None:
         )
 
 
-def _gap_between(reference: Survey, moving: Survey) -> float:
-    """Largest empty distance [m] along east or north between the bounding boxes; 0 if they meet."""
+def surveys_apart(reference: Survey, moving: Survey, radius: float) -> str:
+    """Say that no offset within `radius` [m] can bring the surveys together; empty if one may."""
     a, b = reference.bounds, moving.bounds
     gaps = np.maximum(a[0, :2] - b[1, :2], b[0, :2] - a[1, :2])
-    return float(max(gaps.max(), 0.0))
+    away = float(gaps.max())
+    if away <= radius:
+        return ""
+    return (
+        f"the surveys lie {away:.4g} m apart, beyond the search radius of {radius:g} m; check "
+        "their shifts (--reference-shift, --moving-shift) and CRS"
+    )
 
 
 def _cells(settings: Settings) -> dict[str, float]:
@@ -281,19 +421,36 @@ def _levels(
     return made
 
 
-def _rasterize(
-    reference: Survey, moving: Survey, settings: Settings, masks: Mapping[str, Any], tell: Progress
+def rasterize_pair(
+    reference: Survey,
+    moving: Survey,
+    settings: Settings,
+    masks: Mapping[str, Any],
+    tell: Progress,
+    motion: Transform | None = None,
+    known: Pairs | None = None,
 ) -> Pairs:
-    """Both surveys at each cell that is needed, on one lattice."""
+    """Both surveys at each cell that is needed, on one lattice.
+
+    With a `motion` the moving survey is moved by it, and the reference taken from what is `known`.
+    """
     cells = _cells(settings)
     coarsest = max(cells.values())
-    made = []
-    for done, (which, survey) in enumerate((("reference", reference), ("moving", moving))):
-        fits = all(abs(coarsest / c - round(coarsest / c)) < 1e-9 for c in cells.values())
-        grids = {n: survey_grid(survey, c, coarsest if fits else None) for n, c in cells.items()}
-        made.append(_levels(survey, grids, settings, masks[which]))
-        tell("rasterize", 0.5 * (done + 1))
-    return {name: (made[0][name], made[1][name]) for name in cells}
+    fits = all(abs(coarsest / c - round(coarsest / c)) < 1e-9 for c in cells.values())
+    lattice = coarsest if fits else None
+
+    def made(survey: Survey, which: str, motion: Transform | None) -> dict[str, SurveyRaster]:
+        grids = {n: survey_grid(survey, c, lattice, transform=motion) for n, c in cells.items()}
+        return _levels(survey, grids, settings, masks[which], motion)
+
+    if known is not None:
+        moved = made(moving, "moving", motion)
+        return {name: (known[name][0], moved[name]) for name in cells}
+    still = made(reference, "reference", None)
+    tell("rasterize", 0.5)
+    moved = made(moving, "moving", motion)
+    tell("rasterize", 1.0)
+    return {name: (still[name], moved[name]) for name in cells}
 
 
 def _refine(judgement: judging.Judgement, pairs: Pairs, settings: Settings) -> Refined:
@@ -311,56 +468,79 @@ def _refine(judgement: judging.Judgement, pairs: Pairs, settings: Settings) -> R
     return refine(used, (best.east, best.north), best.sigma, agree)  # type: ignore[arg-type]
 
 
+def completed(
+    moving: Survey, decision: Decision
+) -> tuple[Transform | None, Float64 | None, dict[str, Any] | None]:
+    """Transform at the moving survey's centre, its covariance, and the error at the overlap."""
+    refined, heights, transform = decision.refined, decision.heights, decision.transform
+    if refined is None or heights is None or transform is None:
+        return None, None, None
+    transform = transform.at(moving.centre)
+    covariance = _covariance(refined, heights, transform)
+    place = transform.apply(heights.place)
+    return transform, covariance, statistics.registration_error(covariance, transform, place)
+
+
 def _lay_down(
-    reference: Survey,
     moving: Survey,
-    refined: Refined | None,
+    transform: Transform | None,
     settings: Settings,
     masks: Mapping[str, Any],
     pairs: Pairs,
-) -> tuple[Transform | None, float, dict[str, Any]]:
-    """Complete the transform by its height, and rasterize both surveys on common grids."""
+) -> dict[str, Any]:
+    """Rasterize both surveys on common grids, the moving one before and after."""
     rasters: dict[str, Any] = {}
-    horizontal = None if refined is None else _horizontal(refined, moving)
     grids = {name: common_grid(a.grid, b.grid) for name, (a, b) in pairs.items()}
     for name in ("dem", "ortho"):
         rasters[f"reference_{name}"] = statistics.on_grid(pairs[name][0], grids[name])
         rasters[f"moving_{name}_before"] = statistics.on_grid(pairs[name][1], grids[name])
-    if horizontal is not None:
-        moved = _levels(moving, grids, settings, masks["moving"], horizontal)
-        rasters |= {"moving_dem": moved["dem"], "moving_ortho": moved["ortho"]}
-    if horizontal is None:
-        return None, float("nan"), rasters
-    up, up_sigma = statistics.height_offset(rasters["reference_dem"], rasters["moving_dem"])
-    for name in ("dem", "ortho"):
-        raster = rasters[f"moving_{name}"]
-        rasters[f"moving_{name}"] = dataclasses.replace(raster, datum=raster.datum + up)
-    offset = horizontal.offset + np.array([0.0, 0.0, up])
-    return dataclasses.replace(horizontal, offset=offset), up_sigma, rasters
+    if transform is None:
+        return rasters
+    moved = _levels(moving, grids, settings, masks["moving"], transform)
+    return rasters | {"moving_dem": moved["dem"], "moving_ortho": moved["ortho"]}
 
 
-def _horizontal(refined: Refined, moving: Survey) -> Transform:
-    """Rotation about the vertical and horizontal offset, stated at the moving survey's centre."""
+def _internal(
+    refined: Refined | None,
+    transform: Transform | None,
+    rasters: Mapping[str, Any],
+    settings: Settings,
+) -> tuple[Internal, dict[str, Any]]:
+    """Measure how the models bend; where a warp is asked for and found, bend the moving maps."""
+    rasters = dict(rasters)
+    if refined is None or transform is None:
+        return Internal(""), rasters
+    dems = rasters["reference_dem"], rasters["moving_dem"]
+    internal = measure(refined.tiles, transform, *dems, settings.warp)
+    if internal.warp is not None and settings.warp.model != "none":
+        for name in ("moving_dem", "moving_ortho"):
+            rasters[name] = warped_raster(rasters[name], internal.warp)
+        return internal.applied(), rasters
+    return dataclasses.replace(internal, warp=None), rasters
+
+
+def _horizontal(refined: Refined, scale: float = 1.0) -> Transform:
+    """Rotation about the vertical, horizontal offset and scale."""
     c, s = np.cos(refined.yaw), np.sin(refined.yaw)
     rotation = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    pivot = np.append(refined.pivot, moving.centre[2])
     # a tenth of a nanometre is the end of what float64 heights at UTM size can say
     offset = np.round(np.append(refined.offset, 0.0), 10)
-    return Transform(rotation, 1.0, offset, pivot).at(moving.centre)
+    return Transform(rotation, scale, offset, np.append(refined.pivot, 0.0))
 
 
-def _covariance(refined: Refined, up_sigma: float, transform: Transform | None) -> Float64:
-    """Of (east, north, up, yaw) at the transform's pivot: yaw's doubt grows with the lever."""
-    assert transform is not None
-    lever = transform.pivot[:2] - refined.pivot
-    carry = np.eye(3)
-    carry[0, 2], carry[1, 2] = -lever[1], lever[0]
-    moved = carry @ refined.covariance @ carry.T
-    covariance = np.zeros((4, 4))
-    keep = np.ix_([0, 1, 3], [0, 1, 3])
-    covariance[keep] = moved
-    covariance[2, 2] = up_sigma**2
-    return covariance
+def _covariance(refined: Refined, heights: Heights, transform: Transform) -> Float64:
+    """(7, 7) at the transform's pivot: the doubt of yaw and tilt grows with the lever."""
+    start = np.append(refined.pivot, heights.place[2])
+    covariance = np.zeros((7, 7))
+    known = [0, 1, 5, 6][: len(refined.covariance)]
+    covariance[np.ix_(known, known)] = refined.covariance
+    carry = statistics.lever(transform.apply(heights.place) - transform.apply(start))
+    covariance = carry @ covariance @ carry.T
+    covariance[2:5, 2:5] += heights.covariance
+    home = transform.pivot + transform.offset
+    carry = statistics.lever(home - transform.apply(heights.place))
+    covariance = carry @ covariance @ carry.T
+    return np.asarray(0.5 * (covariance + covariance.T))
 
 
 def _residuals(refined: Refined | None) -> dict[str, Float64]:
@@ -380,15 +560,10 @@ def _too_far(
     reference: Survey,
     moving: Survey,
     settings: Settings,
-    away: float,
+    reason: str,
     seconds: Mapping[str, float],
     notes: list[str],
 ) -> Registration:
-    reason = (
-        f"the surveys lie {away:.4g} m apart, beyond the search radius of "
-        f"{settings.search.radius:g} m; check their shifts "
-        "(--reference-shift, --moving-shift) and CRS"
-    )
     estimates = tuple(
         OffsetEstimate(m, "failed", "the surveys do not overlap") for m in settings.methods
     )

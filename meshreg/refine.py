@@ -1,8 +1,9 @@
 """The rigid answer from tile offsets: offset, yaw and their covariance.
 
 Both surveys are cut into tiles that are matched alone (`tiles`). A rotation about the vertical
-shows as tile offsets that turn; what is left is the internal distortion of the two models, which
-also says how sure the answer is.
+shows as tile offsets that turn; what is left is the internal distortion of the two models. The
+answer is the rigid motion that fits the whole overlap best, which is not the one that fits the
+tiles best (`kriging`).
 """
 
 from __future__ import annotations
@@ -12,12 +13,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from meshreg.kriging import Field, Ground, best_motion
 from meshreg.offsets import neutral
 from meshreg.offsets.surface import MAD_TO_SIGMA
-from meshreg.tiles import MAX_YAW, TileOffsets, correlated_tiles, polished_tiles
+from meshreg.tiles import MAX_YAW, Guess, TileOffsets, correlated_tiles, polished_tiles
 from meshreg.types import Float64, SurveyRaster
 
 MIN_TILES = 6
+NODES = 20  # along the overlap's side
+RESOLUTION = 0.01  # cells: what sampling alone leaves open, alike for all tiles
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +42,8 @@ class Refined:
     residuals : (M, 2) float64
         Tile offset less the rigid answer's [m].
     weights : (M,) float64
+    field : Field or None
+        Most likely offset at any place, internal warp included.
     note : str
         What the user should know.
     doubt : str
@@ -51,6 +57,7 @@ class Refined:
     tiles: TileOffsets | None = None
     residuals: Float64 | None = None
     weights: Float64 | None = None
+    field: Field | None = None
     note: str = ""
     doubt: str = ""
 
@@ -74,15 +81,20 @@ def refine(
     agree : float
         The refined offset may differ from the judged one by this much [m].
     """
-    centre = _overlap_centre(rasters[0][0], rasters[0][1], offset)
+    ground = overlap_ground(rasters[0][0], rasters[0][1], offset)
+    centre = ground.share @ ground.places
     coarse = Refined(centre, np.array(offset), 0.0, _block_diagonal(sigma, MAX_YAW**2 / 9))
     tiles = _joined([correlated_tiles(a, b, channel, offset) for a, b, channel in rasters])
-    best = _rigid(tiles, centre)
-    if best is None:
+    if not _enough(tiles):
         return replace(coarse, note="too few tiles match on their own to measure yaw")
+    assert tiles is not None
+    rough = fit(tiles, centre, yaw_free=True)
+    assert rough.weights is not None
+    kept = tiles.only(rough.weights > 0)
+    best = over_ground(kept, ground, centre) if _enough(kept) else rough
     for reference, moving, channel in rasters:
         if channel == "terrain":
-            finer = _polished(reference, moving, best)
+            finer = _polished(reference, moving, ground, rough)
             best = finer if finer is not None and _size(finer) < _size(best) else best
     if abs(best.yaw) > MAX_YAW:
         turn = np.rad2deg(best.yaw)
@@ -90,32 +102,54 @@ def refine(
     moved = float(np.hypot(*(best.offset - offset)))
     if moved > agree:
         return replace(coarse, doubt=f"tiles alone lie {moved:.2f} m from the whole's offset")
-    return best
+    floor = (RESOLUTION * rasters[0][1].grid.cell) ** 2
+    return replace(best, covariance=best.covariance + np.diag([floor, floor, 0.0]))
 
 
-def _polished(reference: SurveyRaster, moving: SurveyRaster, start: Refined) -> Refined | None:
+def _polished(
+    reference: SurveyRaster, moving: SurveyRaster, ground: Ground, start: Refined
+) -> Refined | None:
     """Polish the tiles from the rigid answer, and again from what they say, until it stays."""
-    answer: Refined | None = start
+    turn = start.yaw * np.array([[0.0, -1.0], [1.0, 0.0]])
+    centre, offset = start.pivot, start.offset
+    guess: Guess = lambda places: start.offset + (places - centre) @ turn.T  # noqa: E731
     for _ in range(4):
-        before = answer
-        assert before is not None
-        tiles = polished_tiles(reference, moving, before.offset, before.yaw, before.pivot)
-        answer = _rigid(tiles, before.pivot)
-        if answer is None:
+        tiles = polished_tiles(reference, moving, offset, guess)
+        if not _enough(tiles):
             return None
-        if np.hypot(*(answer.offset - before.offset)) < 0.005 * moving.grid.cell:
+        assert tiles is not None
+        answer = over_ground(tiles, ground, centre)
+        assert answer.field is not None
+        moved, offset, guess = np.hypot(*(answer.offset - offset)), answer.offset, answer.field
+        if moved < 0.005 * moving.grid.cell:
             break
     return answer
 
 
-def _rigid(tiles: TileOffsets | None, pivot: Float64) -> Refined | None:
-    """Rigid fit of enough tiles; the yaw is 0 where it is under two of its sigmas."""
-    if tiles is None or len(np.unique(tiles.block)) < MIN_TILES:
-        return None
-    turning = fit(tiles, pivot, yaw_free=True)
-    if abs(turning.yaw) > 2 * np.sqrt(turning.covariance[2, 2]):
-        return turning
-    return fit(tiles, pivot, yaw_free=False)
+def over_ground(tiles: TileOffsets, ground: Ground, pivot: Float64) -> Refined:
+    """Rigid motion that fits the whole ground best; the yaw is 0 where it is under two sigmas.
+
+    The ground counts as the reference sees it: where the models stretch, so do its cells.
+    """
+    places, offsets = tiles.places, tiles.offsets
+    motion = best_motion(places, offsets, ground, pivot, yaw_free=True)
+    share = ground.share * np.clip(motion.field.growth(ground.places), 0.5, 2.0)
+    ground = replace(ground, share=share / share.sum())
+    motion = best_motion(places, offsets, ground, pivot, yaw_free=True, start=motion)
+    covariance, yaw = motion.covariance, float(motion.answer[2])
+    offset = motion.answer[:2]
+    if abs(yaw) <= 2 * np.sqrt(covariance[2, 2]):
+        still = best_motion(places, offsets, ground, pivot, yaw_free=False, start=motion)
+        yaw, offset = 0.0, still.answer
+        covariance = _block_diagonal(still.covariance, covariance[2, 2])
+    arm = places - pivot
+    left = offsets - offset - yaw * np.stack([-arm[:, 1], arm[:, 0]], axis=1)
+    used = motion.used.astype(np.float64)
+    return Refined(pivot, offset, yaw, covariance, tiles, left, used, motion.field)
+
+
+def _enough(tiles: TileOffsets | None) -> bool:
+    return tiles is not None and len(np.unique(tiles.block)) >= MIN_TILES
 
 
 def _size(refined: Refined) -> float:
@@ -205,10 +239,10 @@ def _joined(found: Sequence[TileOffsets | None]) -> TileOffsets | None:
     )
 
 
-def _overlap_centre(
+def overlap_ground(
     reference: SurveyRaster, moving: SurveyRaster, offset: tuple[float, float]
-) -> Float64:
-    """Centroid [m], in moving coordinates, of the moving cells that fall on reference cells."""
+) -> Ground:
+    """Places [m] in the moving survey that stand for its cells that fall on reference cells."""
     mask = moving.valid if moving.valid.any() else moving.color_valid
     target = reference.valid if reference.valid.any() else reference.color_valid
     row, col = np.nonzero(mask)
@@ -220,7 +254,12 @@ def _overlap_centre(
     inside[inside] = target[r[inside], c[inside]]
     if not inside.any():
         inside[:] = True
-    return np.array([east[inside].mean(), north[inside].mean()])
+    row, col, east, north = row[inside], col[inside], east[inside], north[inside]
+    block = int(max(np.ptp(row), np.ptp(col))) // NODES + 1
+    node = (row // block) * (cols + mask.shape[1]) + col // block
+    _, node, count = np.unique(node, return_inverse=True, return_counts=True)
+    places = np.stack([np.bincount(node, east), np.bincount(node, north)], axis=1)
+    return Ground(places / count[:, None], count / count.sum())
 
 
 def _block_diagonal(sigma: Float64, yaw_variance: float) -> Float64:

@@ -89,7 +89,14 @@ class JudgeSettings:
     accept_gap: float = 4.0
     overwhelming_gap: float = 8.0
     max_false_alarm: float = 1e-6  # more is not accepted
-    chance_false_alarm: float = 1e-4  # more is chance: rejected
+    chance_false_alarm: float = 1e-3  # more is chance: rejected
+
+
+@dataclass(frozen=True)
+class RefineSettings:
+    """From a cell to a millimetre (`meshreg.refine`, `heights`, `surfaces`)."""
+
+    surfaces: str = "none"  # "gicp": a last step on the 3-D surfaces, with Open3D
 
 
 @dataclass(frozen=True)
@@ -113,6 +120,7 @@ class Settings:
     terrain: TerrainSettings = field(default_factory=TerrainSettings)
     mutual_information: MutualInformationSettings = field(default_factory=MutualInformationSettings)
     judge: JudgeSettings = field(default_factory=JudgeSettings)
+    refine: RefineSettings = field(default_factory=RefineSettings)
     warp: WarpSettings = field(default_factory=WarpSettings)
 
     @classmethod

@@ -8,6 +8,7 @@ horizontal warp of the models from bending a single global fit toward where they
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,6 +22,7 @@ from meshreg.types import Bool, Float64, Grid, SurveyRaster
 
 MAX_YAW = np.deg2rad(1.0)
 HIGH_PASS = 2.0  # cells: finer than any warp, coarser than the noise of single cells
+Guess = Callable[[Float64], Float64]
 TILE_CELLS = 36  # at most; on small patches at least 7 tiles a side as long as they hold 16 cells
 
 
@@ -38,12 +40,24 @@ class TileOffsets:
         Tiles at the same place share a block, whichever channel saw them.
     channel : (M,) int
         Which of the channels matched it.
+    level : (M,) float64 or None
+        Mean height [m] of the moving tile, absolute.
+    rise : (M,) float64 or None
+        Median height [m] to add to it, once it lies where `offsets` puts it.
     """
 
     places: Float64
     offsets: Float64
     block: np.ndarray
     channel: np.ndarray
+    level: Float64 | None = None
+    rise: Float64 | None = None
+
+    def only(self, keep: Bool) -> TileOffsets:
+        """Return the tiles where `keep` (M,) is True."""
+        optional = (None if value is None else value[keep] for value in (self.level, self.rise))
+        several = (self.places, self.offsets, self.block, self.channel)
+        return TileOffsets(*(value[keep] for value in several), *optional)
 
 
 @dataclass(frozen=True)
@@ -76,12 +90,12 @@ class Overlap:
         return min(self.rows[1] - self.rows[0], self.cols[1] - self.cols[0])
 
     def tiles(self, side: int) -> list[tuple[int, int]]:
-        """Top left corners of the whole tiles of `side` cells."""
-        return [
-            (top, left)
-            for top in range(self.rows[0], self.rows[1] - side + 1, side)
-            for left in range(self.cols[0], self.cols[1] - side + 1, side)
-        ]
+        """Top left corners of tiles of `side` cells, from edge to edge: they overlap a little."""
+        axes = []
+        for low, high in (self.rows, self.cols):
+            count = -(-(high - low) // side)
+            axes.append(np.rint(np.linspace(low, high - side, count)).astype(int).tolist())
+        return [(top, left) for top in axes[0] for left in axes[1]]
 
 
 def correlated_tiles(
@@ -147,39 +161,73 @@ def _correlate_tile(
 
 
 def polished_tiles(
-    reference: SurveyRaster,
-    moving: SurveyRaster,
-    offset: Float64,
-    yaw: float,
-    pivot: Float64,
+    reference: SurveyRaster, moving: SurveyRaster, offset: Float64, guess: Guess
 ) -> TileOffsets | None:
     """Read each tile's offset by robust Gauss-Newton on high-passed heights.
 
-    Starts from the rigid motion (`offset` [m] at `pivot`, `yaw` [rad]); a tile that runs more than
-    three cells from it, or shows too little, is left out.
+    Parameters
+    ----------
+    reference, moving : SurveyRaster
+    offset : (2,) float64
+        East and north [m] of the whole, which says where the surveys overlap.
+    guess : callable
+        Of places (M, 2): the offsets (M, 2) to start from. A tile's offset is that of its centre
+        only as far as the guess bends as the models do, since the relief that tells it may lie to
+        one side. A tile that runs more than three cells from its start, or shows too little, is
+        left out.
     """
     overlap = Overlap.at(reference.grid, moving.grid, (float(offset[0]), float(offset[1])))
     side = int(np.clip(overlap.side // 7, 16, TILE_CELLS))
     if overlap.side < 3 * side:
         return None
     still, moved = _Relief.of(reference), _Relief.of(moving)
+    bend = _Bend.of(guess, moving.grid, side)
+    half = 0.5 * (side - 1)
     found = []
     for top, left in overlap.tiles(side):
-        part = (slice(top, top + side), slice(left, left + side))
-        middle = np.array(moving.grid.east_north(top + 0.5 * (side - 1), left + 0.5 * (side - 1)))
-        arm = middle - pivot
-        start = offset + yaw * np.array([-arm[1], arm[0]])
-        answer = _polish(still, moved, part, middle, start, yaw)
-        if answer is not None and np.hypot(*(answer - start)) <= 3 * moving.grid.cell:
-            found.append((*middle, *answer))
+        answer = _polish(still, moved, (top, left, side), bend)
+        if answer is not None:
+            middle = np.array([top + half, left + half])
+            start = bend.at(middle[:, None])[0]
+            found.append((*moving.grid.east_north(*middle), *(start + answer[:2]), *answer[2:]))
     return _as_tiles(found, 0)
 
 
 @dataclass(frozen=True, eq=False)
+class _Bend:
+    """A guess of the offset, computed at nodes `step` cells apart and smooth between them."""
+
+    step: int
+    nodes: Float64  # (2, R, C): spline coefficients of east and north [m]
+
+    @classmethod
+    def of(cls, guess: Guess, grid: Grid, side: int) -> _Bend:
+        from scipy.ndimage import spline_filter
+
+        step = max(side // 4, 1)
+        rows, cols = (np.arange(-step, length + 2 * step, step) for length in grid.shape)
+        row, col = np.meshgrid(rows, cols, indexing="ij")
+        places = np.stack(grid.east_north(row.ravel(), col.ravel()), axis=1)
+        offsets = guess(places).T.reshape(2, len(rows), len(cols))
+        return cls(step, np.stack([spline_filter(part, 3) for part in offsets]))
+
+    def at(self, row_col: Float64) -> Float64:
+        """Offset (N, 2) [m] at rows and columns (2, N)."""
+        from scipy.ndimage import map_coordinates
+
+        at = row_col / self.step + 1.0
+        return np.stack([map_coordinates(p, at, order=3, prefilter=False) for p in self.nodes], 1)
+
+
+@dataclass(frozen=True, eq=False)
 class _Relief:
-    """High-passed heights as a cubic spline, their slopes per metre, and where they are known."""
+    """High-passed heights as a cubic spline, their slopes per metre, and where they are known.
+
+    `height` is absolute [m], 0 where unknown.
+    """
 
     grid: Grid
+    height: Float64
     field: Float64
     spline: Float64
     d_east: Float64
@@ -197,32 +245,30 @@ class _Relief:
         d_row, d_col = (np.asarray(d, np.float64) for d in np.gradient(field))
         inner = binary_erosion(mask, iterations=3, border_value=0)
         cell = raster.grid.cell
-        return cls(raster.grid, field, spline_filter(field, 3), d_col / cell, -d_row / cell, inner)
+        whole = np.where(mask, raster.height.astype(np.float64) + raster.datum, 0.0)
+        spline = spline_filter(field, 3)
+        return cls(raster.grid, whole, field, spline, d_col / cell, -d_row / cell, inner)
 
 
 def _polish(
-    still: _Relief,
-    moved: _Relief,
-    part: tuple[slice, slice],
-    middle: Float64,
-    offset: Float64,
-    yaw: float,
+    still: _Relief, moved: _Relief, tile: tuple[int, int, int], bend: _Bend
 ) -> Float64 | None:
-    """Offset [m] at the tile's middle that lays its heights on the reference's.
+    """Find what to add to the bent offset [m] so that a tile fits; also its level and rise.
 
-    Residual ``r = f1(R u + t) - f2(u)``, Tukey's biweight at four robust deviations, slopes as
-    the mean of both surveys' (so that neither survey's noise shrinks the step).
+    Residual ``r = f1(u + b(u) + t) - f2(u)``, Tukey's biweight at four robust deviations, slopes
+    as the mean of both surveys' (so that neither survey's noise shrinks the step).
     """
     from scipy.ndimage import map_coordinates
 
-    row, col = np.nonzero(moved.mask[part])
-    if len(row) < 0.5 * (part[0].stop - part[0].start) ** 2:
+    top, left, side = tile
+    row, col = np.nonzero(moved.mask[top : top + side, left : left + side])
+    if len(row) < 0.5 * side**2:
         return None
-    row, col = row + part[0].start, col + part[1].start
+    row, col = row + top, col + left
+    start = bend.at(np.stack([row, col]).astype(float))
     east, north = moved.grid.east_north(row, col)
-    arm_east, arm_north = east - middle[0], north - middle[1]
-    east = middle[0] + np.cos(yaw) * arm_east - np.sin(yaw) * arm_north
-    north = middle[1] + np.sin(yaw) * arm_east + np.cos(yaw) * arm_north
+    east, north = east + start[:, 0], north + start[:, 1]
+    offset = np.zeros(2)
     value = moved.field[row, col]
     slope = np.stack([moved.d_east[row, col], moved.d_north[row, col]], axis=1)
     for _ in range(15):
@@ -245,13 +291,26 @@ def _polish(
         step = -np.linalg.solve(normal, (design * weight[:, None]).T @ residual)
         offset = offset + step
         if np.abs(step).max() < 1e-7:
-            return offset
-    return offset if np.abs(step).max() < 0.01 * still.grid.cell else None
+            break
+    if not (
+        np.abs(step).max() < 0.01 * still.grid.cell and np.hypot(*offset) <= 3 * still.grid.cell
+    ):
+        return None
+    level = moved.height[row, col]
+    rise = map_coordinates(still.height, at, order=1) - level[inside]
+    return np.array([*offset, level.mean(), np.median(rise[weight > 0])])
 
 
 def _as_tiles(found: list[tuple[Any, ...]], channel: int) -> TileOffsets | None:
     if not found:
         return None
     rows = np.array(found, float)
-    numbers = np.arange(len(rows))
-    return TileOffsets(rows[:, :2], rows[:, 2:], numbers, np.full(len(rows), channel))
+    numbers, whole = np.arange(len(rows)), rows.shape[1] > 4
+    return TileOffsets(
+        rows[:, :2],
+        rows[:, 2:4],
+        numbers,
+        np.full(len(rows), channel),
+        rows[:, 4] if whole else None,
+        rows[:, 5] if whole else None,
+    )

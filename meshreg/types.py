@@ -529,7 +529,7 @@ class Warp:
         """(N, 3, 2): slopes of the displacement along east and north, inside the box."""
         points = np.asarray(points, float)
         slopes = [self._sum(points, (along == 1, along == 0)) for along in (0, 1)]
-        return np.stack(slopes, axis=-1) / self._steps
+        return np.asarray(np.stack(slopes, axis=-1) / self._steps)
 
     def apply(self, points: Any) -> Float64:
         """Bend absolute points (N, 3) [m] that the transform has moved."""
@@ -550,7 +550,7 @@ class Warp:
         for _ in range(100):
             before, found = found, points - self.displacement(found)
             if np.abs(found - before).max(initial=0.0) <= tolerance:
-                return found
+                return np.asarray(found)
         raise UsageError("The warp cannot be inverted: it folds the ground.")
 
     @property
@@ -631,8 +631,10 @@ class Registration:
     transform : Transform or None
         `reference_from_moving` in absolute coordinates, pivot at the centre of the moving
         survey's bounding box; None when rejected, the best hypothesis when in review.
-    covariance : (4, 4) float64 or None
-        Of (east, north, up [m], yaw [rad]) at the transform's pivot.
+    covariance : (7, 7) float64 or None
+        Of (east, north, up [m], tilt_east, tilt_north, yaw [rad], scale [-]) at the transform's
+        pivot; the angles are right-handed turns about the east, north and up axes. Rows of what
+        was not estimated are zero. The internal bending of the models is not in it.
     estimates : tuple of OffsetEstimate
     hypotheses : tuple of mappings
         Ranked candidates with their neutral scores.
@@ -642,6 +644,14 @@ class Registration:
         path, sha256, counts, shift, crs of each survey.
     settings, versions, seconds : mapping
     notes : tuple of str
+    registration_error : mapping or None
+        Standard deviations x, y, z and the largest in any direction, `isotropic` [m], at `at`, the
+        centroid of the overlap in the reference (`meshreg.statistics.registration_error`).
+    internal : mapping or None
+        The internal error: `said` in words, whether a warp was `applied`, and numbers of the
+        `horizontal` and `vertical` model (`meshreg.warp`); None where it was not measured.
+    warp : Warp or None
+        The bend that was applied after the transform, where one was asked for and found.
     evidence : mapping
         In memory only: rasters before and after, residual field; for figures.
     schema : str
@@ -663,10 +673,13 @@ class Registration:
     notes: tuple[str, ...] = ()
     evidence: Mapping[str, Any] = field(default_factory=lambda: _NOTHING)
     schema: str = "meshreg.registration/1"
+    registration_error: Mapping[str, Any] | None = None
+    internal: Mapping[str, Any] | None = None
+    warp: Warp | None = None
 
     def __post_init__(self) -> None:
         if self.covariance is not None:
-            covariance = _frozen(self.covariance, np.float64, (4, 4), "Registration.covariance")
+            covariance = _frozen(self.covariance, np.float64, (7, 7), "Registration.covariance")
             _put(self, "covariance", covariance)
         if (self.transform is None) != (self.verdict == "rejected"):
             raise UsageError(

@@ -136,7 +136,8 @@ def made_registration(verdict: str = "accepted") -> Registration:
         OFFSET,
         np.array([EAST + 12, NORTH + 13, -12.5]),
     )
-    covariance = np.diag([4e-4, 9e-4, 1e-4, 1e-8]) + 1e-9
+    covariance = np.diag([4e-4, 9e-4, 1e-4, 2e-8, 3e-8, 1e-8, 0.0])
+    covariance[:6, :6] += 1e-9
     rejected = verdict == "rejected"
     before = {
         "overlap": 0.95, "cells": 50_000, "height_median": -0.26, "height_nmad": 0.31,
@@ -174,5 +175,8 @@ def made_registration(verdict: str = "accepted") -> Registration:
         versions={"meshreg": "0.1.0", "numpy": np.__version__},
         seconds={"rasterize": 2.5, "sift": 1.2},
         notes=("Made by hand.",),
+        registration_error=None
+        if rejected
+        else {"x": 0.02, "y": 0.03, "z": 0.01, "isotropic": 0.031, "at": [EAST, NORTH, -12.0]},
         evidence=evidence(verdict),
     )  # fmt: skip

@@ -192,19 +192,27 @@ def test_masks_go_to_the_survey_that_they_name(tmp_path: Path) -> None:
     grid = Grid(-1.0, 3.0, 1.0, (4, 4))
     inside = np.zeros((4, 4), bool)
     inside[0:3, 1:3] = True
-    plain = common.read_masks([str(path)], None)
+    square_survey = Survey("a", PointCloud(np.array([[0.0, 0, 0], [2, 2, 0]])))
+    surveys = {"reference": square_survey, "moving": square_survey}
+    plain = common.read_masks([str(path)], surveys)
     assert plain["moving"] is None
     assert plain["reference"] is not None
     np.testing.assert_array_equal(plain["reference"](grid), inside)
-    other = common.read_masks([f"moving:not:{path}"], None)
+    other = common.read_masks([f"moving:not:{path}"], surveys)
     assert other["reference"] is None
     assert other["moving"] is not None
     np.testing.assert_array_equal(other["moving"](grid), ~inside)
-    both = common.read_masks([str(path), f"not:{path}"], None)
+    both = common.read_masks([str(path), f"not:{path}"], surveys)
     assert both["reference"] is not None
     assert not both["reference"](grid).any()
+    # Asked at places, as the rasterizer asks of a survey that it moves.
+    twice = common.read_masks([f"moving:{path}", f"moving:{path}"], surveys)["moving"]
+    assert twice is not None
+    assert twice.at([0.5, 2.5], [0.5, 0.5]).tolist() == [True, False]  # type: ignore[attr-defined]
+    with pytest.raises(UsageError, match="no moving survey"):
+        common.read_masks([f"moving:{path}"], {"reference": square_survey})
     with pytest.raises(InputError):
-        common.read_masks([str(tmp_path / "none.geojson")], None)
+        common.read_masks([str(tmp_path / "none.geojson")], surveys)
 
 
 def test_same_file_twice_is_said(
@@ -217,6 +225,106 @@ def test_same_file_twice_is_said(
     assert "same file" in said
     notes = json.loads((tmp_path / "out" / "registration.json").read_text())["notes"]
     assert any("same file" in note for note in notes)
+
+
+@pytest.mark.parametrize("lost", ["old", "new"])
+def test_a_lost_shift_is_made_up_for_and_said(
+    tmp_path: Path, pair: tuple[str, str], run: Run, verdict: Any, lost: str
+) -> None:
+    """One of two local exports has its shift file: kilometres apart, yet one frame."""
+    asked = verdict("accepted")
+    kept = "new" if lost == "old" else "old"
+    (tmp_path / "in" / f"{kept}_offset.xyz").write_text("731000 5705000 0\n")
+    code, _, error = run("register", *pair, "-o", tmp_path / "out")
+    assert code == 0, error
+    assert "reference's was taken for both" in error
+    shifts = [asked[which].source[0].frame.shift.tolist() for which in ("reference", "moving")]
+    assert shifts == [[731000, 5705000, 0] if kept == "old" else [0, 0, 0]] * 2
+    assert np.abs(asked["reference"].centre - asked["moving"].centre).max() < 0.5
+    document = json.loads((tmp_path / "out" / "registration.json").read_text())
+    assert document["moving"]["shift"] == shifts[0]
+    assert any("731000, 5705000, 0" in note for note in document["notes"])
+    # The registered file lies in the reference file's coordinates: moved by the transform alone.
+    transform = made_registration().transform
+    assert transform is not None
+    first = np.array(Path(pair[1]).read_text().split()[1:4], float)
+    moved = transform.apply(first + shifts[1]) - shifts[0]
+    written = (tmp_path / "out" / "new_registered.obj").read_text().split()[1:4]
+    np.testing.assert_allclose(np.array(written, float), moved, atol=1e-5)
+    # A shift that the user states is not made up for.
+    asked.clear()
+    code, _, error = run("register", *pair, "-o", tmp_path / "two", "--moving-shift", "500000,0,0")
+    assert np.abs(asked["moving"].centre[0] - 500000) < 10
+
+
+@pytest.mark.parametrize("side", ["reference", "moving"])
+def test_a_crs_on_one_side_only_is_no_obstacle(tmp_path: Path, run: Run, side: str) -> None:
+    """The whole way: the numbers of both are one local frame, and it is said."""
+    import pyproj
+    from test_pipeline import OFFSET, displaced, floors, survey
+
+    first, later = floors()
+    reference = survey(first, half=3.0, name="old")
+    moving, _ = displaced(survey(later, half=3.0, seed=2, name="new"))
+    for one in (reference, moving):
+        far = dataclasses.replace(one, origin=one.origin + np.array([731_000.0, 5_705_000.0, 0.0]))
+        meshreg.write_survey(far, tmp_path / f"{one.name}.ply")
+    name = {"reference": "old", "moving": "new"}[side]
+    (tmp_path / f"{name}.prj").write_text(pyproj.CRS(32754).to_wkt("WKT1_ESRI"))
+    out = tmp_path / "out"
+    code, said, error = run(
+        "register", tmp_path / "old.ply", tmp_path / "new.ply", "-o", out,
+        "--search-radius", 4, "--methods", "terrain", "--json",
+    )  # fmt: skip
+    assert code == 0, said + error
+    document = json.loads(said)
+    found = [document["offset"][key] for key in ("east", "north", "up")]
+    np.testing.assert_allclose(found, OFFSET, atol=0.02)
+    assert any("one local frame" in note for note in document["notes"])
+    known = document["reference"]["crs"]
+    assert (known == "EPSG:32754") == (side == "reference")
+    again = meshreg.read_survey(out / "new_registered.ply")
+    assert again.crs == known
+    assert np.abs(again.centre - moving.centre - [731_000, 5_705_000, 0] - found).max() < 0.01
+
+
+def test_two_models_of_unknown_scale_need_one(tmp_path: Path, run: Run, verdict: Any) -> None:
+    asked = verdict("accepted")
+    model = ROOT / "tests" / "data" / "colmap"
+    code, _, error = run("register", model, model, "-o", tmp_path / "out")
+    assert code == 2
+    assert "--scale" in error
+    assert not asked
+    assert list(tmp_path.iterdir()) == []
+    code, _, error = run(
+        "register", model, model, "-o", tmp_path / "out", "--scale", 2, "--scale", 3
+    )
+    assert code == 0, error
+    sizes = [np.ptp(asked[which].bounds[:, 0]) for which in ("reference", "moving")]
+    assert sizes[1] / sizes[0] == pytest.approx(1.5)
+
+
+def test_a_model_that_changes_meanwhile_gives_no_output(
+    tmp_path: Path, run: Run, verdict: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A COLMAP folder as the reference: its files are looked at again at the end."""
+    import shutil
+
+    model = tmp_path / "in" / "model"
+    shutil.copytree(ROOT / "tests" / "data" / "colmap", model)
+    new = write_obj(tmp_path / "in" / "new.obj")
+
+    def register_pair(*surveys: Any, **rest: Any) -> Any:
+        (model / "images.bin").write_bytes((model / "images.bin").read_bytes() + b" ")
+        return made_registration()
+
+    verdict("accepted")
+    monkeypatch.setattr(meshreg.pipeline, "register_pair", register_pair)
+    code, _, error = run("register", model, new, "-o", tmp_path / "out")
+    assert code == 3
+    assert "model" in error
+    assert "changed" in error
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["in"]
 
 
 def test_names_with_markup_are_shown_as_they_are(tmp_path: Path, run: Run, verdict: Any) -> None:
@@ -458,6 +566,24 @@ def test_second_signal_ends_at_once(tmp_path: Path, pair: tuple[str, str]) -> No
     assert process.returncode == 130
 
 
+def test_a_second_run_into_one_folder_is_refused(
+    tmp_path: Path, pair: tuple[str, str], run: Run
+) -> None:
+    out = tmp_path / "out"
+    command = [sys.executable, "-c", BUSY.format(native=False), "register", *pair, "-o", str(out)]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT
+    ) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "working\n"
+        code, said, _ = run("register", *pair, "-o", out, "--json")
+        assert code == 6
+        assert f"process {process.pid}" in json.loads(said)["error"]["cause"]
+        process.send_signal(signal.SIGTERM)
+        process.communicate(timeout=30)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["in"]
+
+
 def test_reader_that_goes_away_is_no_error(tmp_path: Path, pair: tuple[str, str]) -> None:
     code = f"{sys.executable} -m meshreg info {pair[0]} | head -c 1"
     done = subprocess.run(code, shell=True, capture_output=True, text=True, cwd=ROOT, check=False)
@@ -551,6 +677,28 @@ def test_apply_adds_the_shift_that_the_registered_survey_had(
     code, _, error = run("apply", out, pair[1], "-o", tmp_path / "far", "--shift", "9,9,9")
     assert code == 0
     assert "outside the survey that was registered" in error
+
+
+def test_apply_lays_a_model_as_it_was_registered(tmp_path: Path, run: Run, verdict: Any) -> None:
+    """Its scale was stated then; `apply` has it from the record."""
+    import shutil
+
+    verdict("accepted")
+    model, out = tmp_path / "model", tmp_path / "out"
+    shutil.copytree(ROOT / "tests" / "data" / "colmap", model)
+    code, _, error = run("register", model, model, "-o", out, "--scale", 2, "--scale", 3)
+    assert code == 0, error
+    code, _, error = run("apply", out, model, "-o", tmp_path / "moved")
+    assert code == 0, error
+    assert "when it was registered" in error
+    moved, was = (meshreg.read_survey(x / "model_registered") for x in (tmp_path / "moved", out))
+    assert np.abs(moved.geometry.points - was.geometry.points).max() < 1e-9  # type: ignore[union-attr]
+    # Another model has another frame.
+    other = tmp_path / "other"
+    shutil.copytree(was.source[0].path, other)
+    code, _, error = run("apply", out, other, "-o", tmp_path / "two")
+    assert code == 2
+    assert "not the model that was registered" in error
 
 
 def test_apply_refuses_a_rejected_registration(
@@ -820,7 +968,13 @@ def test_surveys_of_different_places_are_rejected(tmp_path: Path, run: Run) -> N
     assert "REJECTED" in said
     assert "--moving-shift" in said
     names = {path.name for path in (tmp_path / "o").iterdir()}
-    assert names == {"registration.json", "settings.toml", "log.txt", "figures"}
+    assert names == {
+        "registration.json",
+        "settings.toml",
+        "log.txt",
+        "figures",
+        "report.html",
+    }
     assert {path.stem for path in (tmp_path / "o" / "figures").iterdir()} == {"extents"}
 
 

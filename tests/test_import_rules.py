@@ -21,16 +21,29 @@ RULES: dict[str, set[str]] = {
     "io": BASE | {"jit"},
     "raster": BASE | {"jit"},
     "tiles": BASE | {"offsets"},
-    "refine": BASE | {"offsets", "tiles"},
+    "kriging": BASE,
+    "refine": BASE | {"kriging", "offsets", "tiles"},
+    "tile_surfaces": BASE | {"offsets", "raster"},
+    "voting": BASE | {"offsets", "tile_surfaces"},
+    "heading": BASE | {"judge", "refine", "tiles", "voting"},
+    "ground": BASE,
+    "heights": BASE | {"ground"},
+    "surfaces": BASE,
     "apply": BASE,
     "report": BASE,
+    "ladder": BASE,
+    "warp_rasters": BASE,
+    "warp": BASE | {"ladder", "tiles", "warp_rasters"},
     "statistics": BASE | {"raster", "offsets"},
     "offsets": BASE | {"jit", "raster"},
     "judge": BASE | {"raster", "offsets"},
-    "pipeline": BASE | {"raster", "offsets", "judge", "refine", "apply", "statistics"},
+    "pipeline": BASE
+    | {"raster", "offsets", "judge", "refine", "heights", "surfaces", "warp", "apply", "statistics"}
+    | {"voting", "heading", "warp_rasters"},
+    "ties": BASE | {"io", "raster", "offsets", "statistics", "report"},
     "doctor": set(),
 }
-FRONT = {"cli", "cli_parts", "benchmark", "__init__", "__main__"}  # may import anything
+FRONT = {"cli", "cli_parts", "benchmark", "selftest", "__init__", "__main__"}  # may import anything
 ESTIMATORS = {"sift", "terrain", "mutual_information"}
 HEAVY = {
     "numba",

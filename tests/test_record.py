@@ -112,6 +112,7 @@ def test_reading_gives_back_every_field(tmp_path: Path, verdict: str) -> None:
         second.transform.rotation, first.transform.rotation, atol=1e-15, rtol=0
     )
     np.testing.assert_array_equal(second.covariance, first.covariance)
+    assert second.registration_error == first.registration_error
     # Written again, it is the same text: nothing drifts.
     again = to_json(registration_document(second))
     third = read_registration(written(tmp_path, second))

@@ -37,7 +37,7 @@ def test_offset_and_yaw(change, yaw_deg):
     yaw = np.deg2rad(yaw_deg)
     error = result.offset - truth_at(result.pivot, yaw)
     assert np.hypot(*error) < (0.006 if change == 0 else 0.012)
-    assert abs(np.rad2deg(result.yaw) + yaw_deg) < (0.01 if change == 0 else 0.1)
+    assert abs(np.rad2deg(result.yaw) + yaw_deg) < (0.02 if change == 0 else 0.1)
 
 
 def test_insignificant_yaw_is_left_at_zero():
@@ -96,7 +96,7 @@ def test_covariance_is_the_scatter():
 
 
 def test_too_few_tiles_keep_the_judged_offset():
-    rasters = seafloor.rasters(5, (0.1, 0.0), change=0.2, half=2.0, size=10.0)
+    rasters = seafloor.rasters(5, (0.1, 0.0), change=0.2, half=1.5, size=10.0)
     result = refine([(*rasters["dem"], "terrain")], (0.1, 0.0), np.eye(2) * 0.01**2, 0.25)
     np.testing.assert_array_equal(result.offset, [0.1, 0.0])
     assert result.yaw == 0.0

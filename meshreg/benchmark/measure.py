@@ -5,16 +5,25 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from meshreg import pipeline
 from meshreg.benchmark.hand import Hand
+from meshreg.benchmark.rasters import turned
 from meshreg.offsets import search_radius
 from meshreg.refine import Refined
 from meshreg.settings import Settings
-from meshreg.types import Float64, OffsetEstimate, Registration, SurveyRaster, Verdict
+from meshreg.types import (
+    Float64,
+    OffsetEstimate,
+    Registration,
+    SurveyRaster,
+    Transform,
+    Verdict,
+)
 
 SUCCESS = 0.25  # m: a larger error is a failure
 LEVEL_95 = -2.0 * math.log(0.05)  # chi-square, 2 degrees of freedom
@@ -58,7 +67,9 @@ def register_rasters(
     """
     cell = pairs["dem"][0].grid.cell
     radius = search_radius(settings, cell) if radius is None else radius
-    return pipeline.decide(dict(pairs), settings.changed({"search.radius": radius}), radius)
+    settings = settings.changed({"search.radius": radius})
+    again = partial(turned, dict(pairs))
+    return pipeline.decide(dict(pairs), settings, radius, turned=again)
 
 
 def of_decision(
@@ -73,6 +84,7 @@ def of_decision(
     best = judgement.best
     gaps = {} if best is None else dict(best.gaps)
     fused = _fused_row(answer, verdict, gaps, decision.seconds)
+    fused |= _error_up(decision.transform, truth)
     rows = [_method_row(e) for e in decision.estimates]
     return _finished(rows, fused, answer, preset, truth, hand)
 
@@ -86,19 +98,24 @@ def of_registration(
         turn = math.atan2(transform.rotation[1, 0], transform.rotation[0, 0])
         covariance = registration.covariance
         if covariance is not None:
-            covariance = covariance[np.ix_([0, 1, 3], [0, 1, 3])]
+            covariance = covariance[np.ix_([0, 1, 5], [0, 1, 5])]
         answer = Answer(transform.pivot[:2], transform.offset[:2], turn, covariance)
     alarm = float(registration.evidence.get("false_alarm", 1.0))
     verdict = _Verdict(registration.verdict, registration.reason, alarm)
     first = registration.hypotheses[0] if registration.hypotheses else {}
     gaps = {c: first[f"{c}_gap"] for c in first.get("channels", ())}
     fused = _fused_row(answer, verdict, gaps, registration.seconds)
-    if transform is not None and truth.get("centroid") is not None:
-        centroid = np.array(truth["centroid"])
-        there = transform.apply(centroid)[2] - centroid[2]
-        fused["error_up"] = float(there - truth["offset"][2])
+    fused |= _error_up(transform, truth)
     rows = [_method_row(e) for e in registration.estimates]
     return _finished(rows, fused, answer, preset, truth, hand)
+
+
+def _error_up(transform: Transform | None, truth: Mapping[str, Any]) -> Row:
+    if transform is None or truth.get("centroid") is None:
+        return {}
+    centroid = np.array(truth["centroid"])
+    there = transform.apply(centroid)[2] - centroid[2]
+    return {"error_up": float(there - truth["offset"][2])}
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,13 @@ import numpy as np
 
 from data_synth.rasters import RasterPair, make_rasters
 from meshreg.benchmark.plan import DEM_CELL, ORTHO_CELL, SIFT_CELL, Job, recipe_of
+from meshreg.heading import turning
 from meshreg.io.atomic import atomic_file
-from meshreg.raster.grid import coarsened
-from meshreg.types import Grid, SurveyRaster
+from meshreg.raster import rasterize
+from meshreg.raster.grid import coarsened, survey_grid
+from meshreg.settings import RasterSettings
+from meshreg.types import Grid, Maps, Survey, SurveyRaster, Transform
+from meshreg.voting import Turn
 
 Rasters = dict[str, SurveyRaster]  # "dem", "ortho", "sift"
 Pairs = dict[str, tuple[SurveyRaster, SurveyRaster]]
@@ -96,6 +100,22 @@ def _raster(stored: Any, prefix: str) -> SurveyRaster:
         samples=stored[f"{prefix}_samples"],
         datum=datum,
     )
+
+
+def turned(pairs: Pairs, turn: Turn) -> tuple[Pairs, Transform]:
+    """Resample the moving survey's rasters, turned about its centre (`meshreg.pipeline.Turned`)."""
+    dem = pairs["dem"][1]
+    motion = turning(turn, np.array([*_middle(dem.grid), dem.datum]))
+    # the survey has been cleaned already: what is known stays known
+    plain = RasterSettings(fill_cells=0, remove_floaters=False, mask_flat_color=False)
+    done = {}
+    for name, (still, raster) in pairs.items():
+        grid, seen = raster.grid, raster.color_valid
+        height = (raster.height + raster.datum).astype(np.float32)
+        survey = Survey(name, Maps(height, grid, raster.color, seen, grid), crs=grid.crs)
+        whole = survey_grid(survey, grid.cell, dem.grid.cell, transform=motion)
+        done[name] = (still, rasterize(survey, whole, plain, transform=motion))
+    return done, motion
 
 
 def rehomed(reference: Rasters, moving: Rasters) -> Pairs:

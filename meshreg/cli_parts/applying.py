@@ -14,6 +14,7 @@ from meshreg.cli_parts.common import SurveyRequest, new_folder, read, require_di
 from meshreg.cli_parts.console import Progress, Voice, logging_to
 from meshreg.cli_parts.guard import Unfinished
 from meshreg.errors import UsageError
+from meshreg.types import Frame, PointCloud
 
 if TYPE_CHECKING:
     from meshreg.types import Registration, Survey
@@ -55,7 +56,8 @@ def apply(request: ApplyRequest, voice: Voice, unfinished: Unfinished) -> dict[s
         require_disk(folder, survey)
         progress("write", 0.0)
         stand_in = reference_stand_in(registration)
-        files = rewrite_survey(survey, registration.transform, folder, stand_in)
+        warp = registration.warp
+        files = rewrite_survey(survey, registration.transform, folder, stand_in, warp=warp)
         unchanged(survey)
         document = {
             "schema": "meshreg.applied/1",
@@ -63,6 +65,7 @@ def apply(request: ApplyRequest, voice: Voice, unfinished: Unfinished) -> dict[s
             "verdict": registration.verdict,
             "survey": survey.name,
             "reference_from_moving": registration.transform.matrix.tolist(),
+            "warped": warp is not None,
             "files": [str(request.out / path.relative_to(folder)) for path in files],
             "notes": [*survey.notes, *notes],
         }
@@ -83,6 +86,8 @@ def _read_like(request: SurveyRequest, registration: Registration) -> tuple[Surv
     from meshreg.io.frames import reframe
 
     survey = read(request)
+    if not survey.scale_known:
+        return _as_registered(survey, registration)
     crs = registration.moving.get("crs")
     if survey.crs is not None and crs is not None and survey.crs != crs:
         survey = reframe(survey, crs)
@@ -102,6 +107,40 @@ def _read_like(request: SurveyRequest, registration: Registration) -> tuple[Surv
         f"{survey.name!r} lies wholly outside the survey that was registered: is it the same "
         "survey, and is its shift right (--shift)?"
     ]
+
+
+def _as_registered(survey: Survey, registration: Registration) -> tuple[Survey, list[str]]:
+    """Lay a model of unknown scale as it was laid when it was registered.
+
+    Raises
+    ------
+    UsageError
+        It is another model: nothing says how the frames of the two lie to each other.
+    """
+    from meshreg.io.mover import to_absolute, to_file
+
+    said = registration.moving
+    if survey.source[0].sha256 not in (said.get("sha256") or ()) or said.get("axes") is None:
+        raise UsageError(
+            f"The scale and the frame of {survey.name!r} are arbitrary, and it is not the model "
+            "that was registered.",
+            remedy="Register it itself, or give the file of that model.",
+        )
+    geometry, was = survey.geometry, survey.source[0].frame
+    assert isinstance(geometry, PointCloud)  # a COLMAP model, the only kind without a scale
+    frame = Frame(said["axes"], said["shift"], said.get("file_crs"), said.get("file_crs"))
+    points = to_absolute(frame, to_file(was, geometry.points + survey.origin))
+    origin = np.round(points.mean(axis=0))
+    return (
+        dataclasses.replace(
+            survey,
+            geometry=dataclasses.replace(geometry, points=points - origin),
+            origin=origin,
+            crs=said.get("crs"),
+            source=(dataclasses.replace(survey.source[0], frame=frame),),
+        ),
+        ["Its scale and place are those that it had when it was registered."],
+    )
 
 
 def _meets(bounds: Any, other: Any) -> bool:

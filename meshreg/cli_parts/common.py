@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from meshreg.errors import OutputError, ResourceLimitError
+from meshreg.errors import OutputError, ResourceLimitError, UsageError
 
 if TYPE_CHECKING:
     from meshreg.cli_parts.guard import Unfinished
@@ -79,11 +79,13 @@ def read(request: SurveyRequest, name: str = "") -> Survey:
     return survey
 
 
-def read_masks(said: Sequence[str], crs: str | None) -> dict[str, Mask | None]:
+def read_masks(said: Sequence[str], surveys: Mapping[str, Survey]) -> dict[str, Mask | None]:
     """Read the masks of each survey, written `[reference:|moving:][not:]FILE`.
 
     A mask holds for the reference unless it says `moving:`: at the right offset that is enough,
-    because only ground that both surveys show is compared. `not:` leaves out what is inside.
+    because only ground that both surveys show is compared. `not:` leaves out what is inside. Its
+    coordinates are those of the survey that it holds for, as that came (before it was taken to the
+    reference's CRS).
     """
     from meshreg.io.masks import read_mask
 
@@ -96,20 +98,36 @@ def read_masks(said: Sequence[str], crs: str | None) -> dict[str, Mask | None]:
             else:
                 which = parts[0]
             name = parts[2]
-        found[which].append(read_mask(name, invert, crs))
+        if which not in surveys:
+            raise UsageError(f"--mask {text!r}: there is no {which} survey here.")
+        here, common = surveys[which], surveys["reference"].crs
+        mask = read_mask(name, invert, here.crs or common, here)
+        if common is not None and mask.crs not in (None, common):
+            mask = mask.to(common)
+        found[which].append(mask)
         LOG.info("mask of the %s: %s%s", which, "all but " if invert else "", name)
     return {which: _every(masks) for which, masks in found.items()}
+
+
+@dataclass(frozen=True)
+class _EveryMask:
+    """Uses what all of several masks use."""
+
+    masks: tuple[Any, ...]
+
+    def __call__(self, grid: Any) -> Any:
+        return np.logical_and.reduce([mask(grid) for mask in self.masks])
+
+    def at(self, east: Any, north: Any) -> Any:
+        """Return which places are used, as `meshreg.io.masks.Mask.at`."""
+        return np.logical_and.reduce([mask.at(east, north) for mask in self.masks])
 
 
 def _every(masks: list[Callable[[Any], Any]]) -> Mask | None:
     """Return the mask that uses what all of them use; None where there is none."""
     if len(masks) < 2:
         return masks[0] if masks else None
-
-    def used(grid: Any) -> Any:
-        return np.logical_and.reduce([mask(grid) for mask in masks])
-
-    return used
+    return _EveryMask(tuple(masks))
 
 
 def out_of_memory(error: MemoryError) -> ResourceLimitError:

@@ -24,6 +24,8 @@ STAGES = {
     "mutual_information": "scanning for mutual information",
     "judge": "judging",
     "refine": "refining",
+    "trials": "recovering known shifts",
+    "surfaces": "polishing on the surfaces",
     "apply": "checking the result",
     "write": "writing",
     "figures": "drawing figures",

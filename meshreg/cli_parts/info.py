@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from meshreg.io.assemble import texel_size
 from meshreg.types import Float64, Maps, Mesh, PointCloud, Survey
 
 if TYPE_CHECKING:
@@ -20,7 +21,7 @@ def describe(survey: Survey) -> dict[str, Any]:
     """Return counts, bounds, spacing, texture pages, CRS, and the guesses, as plain values."""
     low, high = survey.bounds
     geometry = survey.geometry
-    tilt, thin = _plane(survey)
+    tilt, thin = plane(survey)
     document: dict[str, Any] = {
         "schema": "meshreg.info/1",
         "name": survey.name,
@@ -47,7 +48,7 @@ def describe(survey: Survey) -> dict[str, Any]:
         "scale_known": survey.scale_known,
         "up": {"guess": thin, "tilt_degrees": tilt, "level": bool(tilt <= LEVEL)},
         "unit": _unit(survey),
-        "notes": [*survey.notes, *_remarks(survey, tilt, thin)],
+        "notes": [*survey.notes, *remarks(survey, tilt, thin)],
     }
     return document
 
@@ -95,9 +96,7 @@ def _spacing(survey: Survey) -> dict[str, float | None]:
     edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
     spacing: dict[str, float | None] = {"edges": float(np.median(edges))}
     if geometry.uv is not None and geometry.face_texture is not None and geometry.textures:
-        spacing["texels"] = _texel(
-            geometry, slice(None, None, max(1, len(geometry.faces) // _SAMPLE))
-        )
+        spacing["texels"] = texel_size(geometry)
     return spacing
 
 
@@ -115,27 +114,8 @@ def _point_spacing(points: Float64) -> float | None:
     return float(np.sqrt(occupied * field**2 / len(points)))
 
 
-def _texel(mesh: Mesh, chosen: slice) -> float | None:
-    assert mesh.uv is not None
-    assert mesh.face_texture is not None
-    page = mesh.face_texture[chosen]
-    used = page >= 0
-    if not used.any():
-        return None
-    sizes = np.array([texture.size for texture in mesh.textures], float)[page[used]]
-    uv = mesh.uv[chosen][used].astype(np.float64) * sizes[:, None, :]
-    corners = mesh.vertices[mesh.faces[chosen][used]]
-    first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    area = np.linalg.norm(np.cross(first, second), axis=1)
-    a, b = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
-    pixels = np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
-    if not pixels.sum() > 0:
-        return None
-    return float(np.sqrt(area.sum() / pixels.sum()))
-
-
-def _plane(survey: Survey) -> tuple[float, str]:
-    """Tilt [degrees] of the plane that fits the survey best, and the axis it is thinnest along."""
+def plane(survey: Survey) -> tuple[float, str]:
+    """Return the tilt [degrees] of the plane that fits best, and the axis it is thinnest along."""
     geometry = survey.geometry
     if isinstance(geometry, Maps):
         return 0.0, "z"
@@ -158,18 +138,19 @@ def _unit(survey: Survey) -> str:
     return "m (stated by the CRS)" if survey.crs else "m (assumed; --unit says otherwise)"
 
 
-def _remarks(survey: Survey, tilt: float, thin: str) -> list[str]:
-    remarks = []
+def remarks(survey: Survey, tilt: float, thin: str) -> list[str]:
+    """Say what the tilt (if over `LEVEL`, first of all) and the coordinates make doubtful."""
+    said = []
     if tilt > LEVEL:
         remark = f"Not level: the plane that fits best is tilted by {tilt:.1f} degrees."
         if thin == "y":
             remark += " It looks Y-up: try --up y."
         else:
             remark += " Level it, or place it by camera positions, before registering."
-        remarks.append(remark)
+        said.append(remark)
     if survey.crs is None and float(np.abs(survey.bounds[:, :2]).max()) > 1e5:
-        remarks.append("Coordinates look projected (UTM or the like), but no CRS is stated.")
-    return remarks
+        said.append("Coordinates look projected (UTM or the like), but no CRS is stated.")
+    return said
 
 
 def show(document: dict[str, Any], voice: Voice) -> None:

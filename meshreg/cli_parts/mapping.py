@@ -46,7 +46,7 @@ def rasterize(request: RasterizeRequest, voice: Voice, unfinished: Unfinished) -
         progress("read", 0.0)
         survey = read(request.survey)
         require_disk(folder, None)
-        mask = read_masks(request.masks, survey.crs)["reference"]
+        mask = read_masks(request.masks, {"reference": survey})["reference"]
         options = request.settings.raster
         cells = choose_cells(survey, survey, options)
         maps: dict[str, Any] = {}

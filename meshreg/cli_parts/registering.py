@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from meshreg.cli_parts import pairing
 from meshreg.cli_parts.common import (
     LOG,
     SurveyRequest,
@@ -19,6 +20,8 @@ from meshreg.cli_parts.common import (
 )
 from meshreg.cli_parts.console import Progress, Voice, logging_to
 from meshreg.cli_parts.guard import Unfinished
+from meshreg.cli_parts.reporting import keep_evidence, write_report
+from meshreg.cli_parts.validating import read_manual
 from meshreg.settings import Settings
 
 if TYPE_CHECKING:
@@ -35,6 +38,7 @@ class RegisterRequest:
     masks: tuple[str, ...] = ()
     settings: Settings = field(default_factory=Settings)
     overwrite: bool = False
+    ties: str | None = None
 
 
 def register(request: RegisterRequest, voice: Voice, unfinished: Unfinished) -> Registration:
@@ -49,7 +53,7 @@ def register(request: RegisterRequest, voice: Voice, unfinished: Unfinished) -> 
 
 def register_into(folder: Path, request: RegisterRequest, progress: Progress) -> Registration:
     """Read, register, write everything into a folder that is there already."""
-    from meshreg.io import same_files, unchanged
+    from meshreg.io import require_warpable, same_files, unchanged
     from meshreg.io.frames import common_crs
     from meshreg.io.record import with_frames, write_record_files
     from meshreg.pipeline import register_pair
@@ -61,15 +65,24 @@ def register_into(folder: Path, request: RegisterRequest, progress: Progress) ->
     reference = read(request.reference, "reference")
     progress("read", 0.5)
     moving = read(request.moving, "moving")
-    notes = []
+    if request.settings.warp.model != "none":
+        require_warpable(moving)
+    requests = (request.reference, request.moving)
+    pairing.require_scale(requests, (reference, moving))
+    radius = request.settings.search.radius or 10.0
+    moving, notes = pairing.same_frame(requests, (reference, moving), radius)
+    notes += pairing.level_notes((reference, moving))
     if same := same_files(reference, moving):
         notes.append(same)
+    masks = read_masks(request.masks, {"reference": reference, "moving": moving})
     moving, crs_notes = common_crs(reference, moving)
     notes += crs_notes
     for note in notes:
         LOG.warning("%s", note)
+    manual, picked = read_manual(request.ties, reference, request.settings)
+    notes += picked
     require_disk(folder, moving)
-    masks = read_masks(request.masks, reference.crs)
+    pairing.require_memory((reference, moving), request.settings)
     reading = time.perf_counter() - clock
     registration = register_pair(
         reference,
@@ -77,10 +90,17 @@ def register_into(folder: Path, request: RegisterRequest, progress: Progress) ->
         request.settings,
         reference_mask=masks["reference"],
         moving_mask=masks["moving"],
+        manual=manual,
         progress=progress,
     )
     for survey in (reference, moving):
         unchanged(survey)
+    later = pairing.masked_notes(registration)
+    if registration.verdict != "accepted":
+        later += pairing.unit_notes((reference, moving))
+    for note in later:
+        LOG.warning("%s", note)
+    notes += later
     registration = dataclasses.replace(
         with_frames(registration, reference, moving),
         notes=(*registration.notes, *notes),
@@ -91,6 +111,8 @@ def register_into(folder: Path, request: RegisterRequest, progress: Progress) ->
     write_record_files(registration, folder, reference=reference, moving=moving)
     progress("figures", 0.0)
     draw_figures(registration, folder / "figures")
+    keep_evidence(registration, folder)
+    write_report(folder)
     progress("figures", 1.0)
     return registration
 

@@ -11,23 +11,12 @@ from rich.panel import Panel
 from rich.table import Table
 
 from meshreg.cli_parts.console import Voice
+from meshreg.report.words import next_steps
 from meshreg.types import OffsetEstimate, Registration
 
 _COLORS = {"accepted": "green", "review": "yellow", "rejected": "red"}
 _STATUS_COLORS = {"ok": "green", "weak": "yellow", "failed": "red"}
 _DASH = "–"
-_NEXT = {
-    "review": (
-        "Look at figures/ and at `hypotheses` in registration.json. The survey was laid down by "
-        "the best hypothesis; use it only if the pictures agree. More overlap, a mask over what "
-        "moves (--mask), or a known shift (--moving-shift) may settle it."
-    ),
-    "rejected": (
-        "No registered survey was written. Look at the score surfaces in figures/. Check that both "
-        "surveys show the same ground, their shifts (--reference-shift, --moving-shift), axes "
-        "(--axes, --up) and units (--unit); a larger --search-radius costs only time."
-    ),
-}
 
 
 def show(registration: Registration, out: Path, voice: Voice) -> None:
@@ -46,22 +35,27 @@ def show(registration: Registration, out: Path, voice: Voice) -> None:
     for note in registration.notes:
         voice.say(f"[dim]note:[/] {escape(note)}")
     voice.say(f"Written to [bold]{escape(str(out))}[/]: {escape(_contents(out))}")
-    if registration.verdict in _NEXT:
-        voice.say(f"[yellow]next:[/] {_NEXT[registration.verdict]}")
+    if (out / "report.html").is_file():
+        voice.say(f"Open [bold]{escape(str(out / 'report.html'))}[/] in a browser.")
+    for step in next_steps(registration):
+        voice.say(f"[yellow]next:[/] {escape(step)}")
 
 
 def _print_offset(registration: Registration, voice: Voice) -> None:
     transform, covariance = registration.transform, registration.covariance
     assert transform is not None
-    sigmas: list[float] = [math.nan] * 4
+    sigmas: list[float] = [math.nan] * 7
     if covariance is not None:
-        sigmas = [math.sqrt(max(float(covariance[k, k]), 0.0)) for k in range(4)]
+        sigmas = [math.sqrt(max(float(covariance[k, k]), 0.0)) for k in range(7)]
     table = Table(box=None, show_header=False, pad_edge=False)
     names = ("east", "north", "up")
     for name, value, sigma in zip(names, transform.offset.tolist(), sigmas[:3], strict=True):
         table.add_row(f"{name}", f"{value:+.4f} m", _plus_minus(sigma, "m", 4))
     yaw = math.degrees(math.atan2(transform.rotation[1, 0], transform.rotation[0, 0]))
-    table.add_row("yaw", f"{yaw:+.4f}°", _plus_minus(math.degrees(sigmas[3]), "°", 4))
+    table.add_row("yaw", f"{yaw:+.4f}°", _plus_minus(math.degrees(sigmas[5]), "°", 4))
+    tilt = math.degrees(math.acos(min(float(transform.rotation[2, 2]), 1.0)))
+    if tilt > 0:
+        table.add_row("tilt", f"{tilt:.4f}°", _plus_minus(math.degrees(max(sigmas[3:5])), "°", 4))
     title = "add to the moving survey"
     if registration.verdict == "review":
         title += " (best hypothesis)"

@@ -18,7 +18,7 @@ from meshreg.io.options import ReadOptions
 if TYPE_CHECKING:
     from meshreg.io.record import read_registration as read_registration
     from meshreg.io.record import write_registration as write_registration
-    from meshreg.types import Survey, Transform
+    from meshreg.types import Survey, Transform, Warp
 
 READERS: dict[str, str] = {
     ".obj": "meshreg.io.obj:read",
@@ -103,7 +103,8 @@ def read_survey(
     -------
     Survey
         Metres, x east, y north, z up; `source` names each file with its frame and checksum,
-        `notes` says what was dropped, repaired or guessed.
+        `notes` says what was dropped, repaired or guessed. A cloud has one point to a place
+        (`meshreg.io.unique`); its files keep theirs.
 
     Raises
     ------
@@ -118,6 +119,7 @@ def read_survey(
         An unknown option.
     """
     from meshreg.io import blocks, merging
+    from meshreg.io.unique import without_repeats
 
     options = options or ReadOptions()
     known = {item.name for item in dataclasses.fields(ReadOptions)}
@@ -126,7 +128,7 @@ def read_survey(
     options = dataclasses.replace(options, **overrides)
     found = blocks.find_blocks(path)
     surveys = [blocks.read_block(block, options) for block in found]
-    return surveys[0] if len(surveys) == 1 else merging.merge(surveys, path)
+    return without_repeats(surveys[0] if len(surveys) == 1 else merging.merge(surveys, path))
 
 
 def write_survey(survey: Survey, path: str | Path) -> tuple[Path, ...]:
@@ -161,6 +163,7 @@ def rewrite_survey(
     folder: str | Path,
     reference: Survey | None = None,
     stem_suffix: str = "_registered",
+    warp: Warp | None = None,
 ) -> tuple[Path, ...]:
     """Move every file of a survey, each in its own format, into the reference's coordinates.
 
@@ -176,6 +179,8 @@ def rewrite_survey(
         Its first file's axes, shift and CRS are what the files are written in; without it they
         keep their own.
     stem_suffix : str
+    warp : Warp, optional
+        The bend that follows the transform.
 
     Returns
     -------
@@ -185,7 +190,7 @@ def rewrite_survey(
     Raises
     ------
     UsageError
-        The survey has no files.
+        The survey has no files, or a warp cannot be written in their format.
     OutputError
         A file could not be written, or did not read back as it should.
     InputError
@@ -193,7 +198,20 @@ def rewrite_survey(
     """
     from meshreg.io import blocks
 
-    return blocks.rewrite(survey, transform, Path(folder), reference, stem_suffix)
+    return blocks.rewrite(survey, transform, Path(folder), reference, stem_suffix, warp)
+
+
+def require_warpable(survey: Survey) -> None:
+    """Make sure that a warp can be written in the survey's formats.
+
+    Raises
+    ------
+    UsageError
+        A file's format moves as a whole only.
+    """
+    from meshreg.io import blocks
+
+    blocks.require_warpable(survey)
 
 
 def unchanged(survey: Survey) -> None:
@@ -244,6 +262,7 @@ __all__ = [
     "load",
     "read_registration",
     "read_survey",
+    "require_warpable",
     "rewrite_survey",
     "same_files",
     "unchanged",

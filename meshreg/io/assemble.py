@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from meshreg.errors import InputError
-from meshreg.io.frames import place
+from meshreg.io.frames import Placed, place
 from meshreg.io.options import ReadOptions
 from meshreg.io.polygons import usable_faces
 from meshreg.io.safe import fingerprint, sha256
@@ -22,6 +22,7 @@ _LOG = logging.getLogger("meshreg")
 _MOST_LOST = 0.01  # share of points that may be NaN or infinite
 _LARGEST = 1e12  # coordinates beyond are damage: no unit makes the Earth that large
 _MOST_WRAPPED = 0.01  # share of texture coordinates that may lie outside the page unsaid
+_SAMPLE = 500_000  # faces that the size of a pixel is measured on
 _AXES = np.eye(3)
 
 
@@ -100,7 +101,7 @@ def assemble_survey(path: Path, raw: RawGeometry, found: Found, options: ReadOpt
     notes = (*found.notes, *notes)
     for note in notes:
         _LOG.warning("%s: %s", path.name, note)
-    placed = place(path, raw.points, options, found.crs, found.axes)
+    placed = place(path, raw.points, options, found.crs, found.axes, detail=lambda: texel_size(raw))
     geometry: Mesh | PointCloud
     if raw.faces is None:
         geometry = PointCloud(placed.points, raw.colors)
@@ -108,6 +109,13 @@ def assemble_survey(path: Path, raw: RawGeometry, found: Found, options: ReadOpt
         geometry = Mesh(
             placed.points, raw.faces, raw.colors, raw.uv, raw.face_texture, raw.textures
         )
+    return placed_survey(path, placed, geometry, replace(found, notes=notes))
+
+
+def placed_survey(
+    path: Path, placed: Placed, geometry: Mesh | PointCloud, found: Found, name: str | None = None
+) -> Survey:
+    """Make the survey of one file whose points are in place; `name` stands in for its stem."""
     source = SourceFile(
         path=path,
         format=found.format,
@@ -119,14 +127,34 @@ def assemble_survey(path: Path, raw: RawGeometry, found: Found, options: ReadOpt
         counts=found.counts,
     )
     return Survey(
-        name=placed.name or path.stem,
+        name=placed.name or name or path.stem,
         geometry=geometry,
         origin=placed.origin,
         crs=placed.frame.crs,
         date=placed.date,
         source=(source,),
-        notes=(*notes, *placed.notes),
+        notes=(*found.notes, *placed.notes),
     )
+
+
+def texel_size(mesh: RawGeometry | Mesh) -> float | None:
+    """Return the side of a texture's pixel on the ground, in units of the points; None without.
+
+    The median would follow small faces; this is the root of all area over all pixels.
+    """
+    if mesh.faces is None or mesh.uv is None or mesh.face_texture is None or not mesh.textures:
+        return None
+    every = slice(None, None, max(1, len(mesh.faces) // _SAMPLE))
+    page = mesh.face_texture[every]
+    used = page >= 0
+    sizes = np.array([texture.size for texture in mesh.textures], float)[page[used]]
+    uv = mesh.uv[every][used].astype(np.float64) * sizes[:, None, :]
+    corners = np.asarray(mesh.points, np.float64)[mesh.faces[every][used]]
+    first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    area = np.linalg.norm(np.cross(first, second), axis=1).sum()
+    a, b = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
+    pixels = np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum()
+    return float(np.sqrt(area / pixels)) if pixels > 0 else None
 
 
 def _rows(values: NDArray[np.bool_]) -> Bool:

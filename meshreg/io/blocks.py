@@ -16,7 +16,7 @@ from meshreg.io.mover import is_plain
 from meshreg.io.options import ReadOptions
 from meshreg.io.safe import fingerprint, open_regular, sha256
 from meshreg.io.sidecar import is_sidecar, write_shift
-from meshreg.types import SourceFile, Survey, Transform
+from meshreg.types import SourceFile, Survey, Transform, Warp
 
 _MAGIC = (
     (b"ply", "PLY", (".ply",)),
@@ -225,10 +225,29 @@ def _recorded(source: SourceFile) -> SourceFile:
     return replace(source, sha256=sha256(source.path), fingerprint=mark)
 
 
+def require_warpable(survey: Survey) -> None:
+    """Do `meshreg.io.require_warpable`."""
+    for source in survey.source:
+        if source.format in ("glb", "gltf", "colmap"):
+            kind = "COLMAP models are" if source.format == "colmap" else "glTF files are"
+            raise UsageError(
+                f"cannot be warped: {kind} moved as a whole.",
+                file=source.path,
+                remedy="Export the survey as .obj, .ply or .laz, or register with --warp none.",
+            )
+
+
 def rewrite(
-    survey: Survey, transform: Transform, folder: Path, reference: Survey | None, suffix: str
+    survey: Survey,
+    transform: Transform,
+    folder: Path,
+    reference: Survey | None,
+    suffix: str,
+    warp: Warp | None = None,
 ) -> tuple[Path, ...]:
     """Do `meshreg.io.rewrite_survey`."""
+    if warp is not None:
+        require_warpable(survey)
     if not survey.source:
         raise UsageError(f"survey {survey.name!r} was made in memory; it has no files to rewrite.")
     try:
@@ -245,7 +264,7 @@ def rewrite(
         if start.crs is not None and survey.crs is not None and start.crs != survey.crs:
             start = replace(start, crs=survey.crs)
         local = to_file(start, survey.centre[None])[0]
-        mover = make_mover(source, transform, target, centre=local)
+        mover = make_mover(source, transform, target, centre=local, warp=warp)
         path = folder / _free_name(source.path, suffix, taken)
         written += load(REWRITERS[source.format])(source, mover, path)
         if source.format != "maps":

@@ -13,14 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from meshreg.errors import InputError
+from meshreg.io.assemble import Found, placed_survey
 from meshreg.io.cloud_write import rewrite, write
 from meshreg.io.frames import place
 from meshreg.io.las_header import LasHead, check_header, file_crs
 from meshreg.io.laz_chunks import las_errors
 from meshreg.io.options import ReadOptions
-from meshreg.io.safe import fingerprint, open_regular, sha256
+from meshreg.io.safe import open_regular
 from meshreg.io.sidecar import find_sidecar
-from meshreg.types import Bool, Float64, PointCloud, SourceFile, Survey, UInt8
+from meshreg.types import Bool, Float64, PointCloud, Survey, UInt8
 
 __all__ = ["read", "rewrite", "write"]
 
@@ -72,24 +73,9 @@ def read(path: Path, options: ReadOptions) -> Survey:
     if unit is not None and options.unit is None and not _sidecar_says_unit(path):
         options = replace(options, unit=unit)  # type: ignore[arg-type]
     placed = place(path, points, options, crs, georeferenced=True)
-    source = SourceFile(
-        path=path,
-        format="las",
-        frame=placed.frame,
-        sidecar=placed.sidecar,
-        sha256=sha256(path),
-        fingerprint=fingerprint(path),
-        counts={"points": head.count, "used": len(points)},
-    )
-    return Survey(
-        name=placed.name or path.name.split(".")[0],
-        geometry=PointCloud(placed.points, None if colors is None else _eight_bit(colors, notes)),
-        origin=placed.origin,
-        crs=placed.frame.crs,
-        date=placed.date,
-        source=(source,),
-        notes=(*notes, *placed.notes),
-    )
+    geometry = PointCloud(placed.points, None if colors is None else _eight_bit(colors, notes))
+    found = Found("las", tuple(notes), counts={"points": head.count, "used": len(points)})
+    return placed_survey(path, placed, geometry, found, path.name.split(".")[0])
 
 
 @contextlib.contextmanager

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from meshreg.errors import InputError, UsageError
-from meshreg.types import OffsetEstimate, Registration, Transform
+from meshreg.types import OffsetEstimate, Registration, Transform, Warp
 
 SCHEMA = "meshreg.registration/1"
 MAX_BYTES = 64_000_000  # a real record has some 20 kB
@@ -52,6 +52,9 @@ def registration_document(registration: Registration) -> dict[str, Any]:
         },
         "offset": offset,
         "covariance": None if covariance is None else covariance.tolist(),
+        "registration_error": registration.registration_error,
+        "internal": registration.internal,
+        "warp": None if registration.warp is None else _warp_document(registration.warp),
         "methods": {e.method: _estimate_document(e) for e in registration.estimates},
         "hypotheses": [dict(hypothesis) for hypothesis in registration.hypotheses],
         "before": dict(registration.before),
@@ -65,6 +68,20 @@ def registration_document(registration: Registration) -> dict[str, Any]:
     }
     plain: dict[str, Any] = _plain(document, "registration")
     return plain
+
+
+def _warp_document(warp: Warp) -> dict[str, Any]:
+    return {
+        "horizontal": warp.horizontal,
+        "vertical": warp.vertical,
+        "low": warp.low.tolist(),
+        "high": warp.high.tolist(),
+        "coefficients": warp.coefficients.tolist(),
+    }
+
+
+def _warp(values: Mapping[str, Any] | None) -> Warp | None:
+    return None if values is None else Warp(**values)
 
 
 def _estimate_document(estimate: OffsetEstimate) -> dict[str, Any]:
@@ -237,6 +254,9 @@ def _registration(document: dict[str, Any], path: Path) -> Registration:
             versions=dict(document["versions"]),
             seconds=dict(document["seconds"]),
             notes=tuple(str(note) for note in document["notes"]),
+            registration_error=document.get("registration_error"),
+            internal=document.get("internal"),
+            warp=_warp(document.get("warp")),
         )
     except UsageError as error:  # a record refused at birth; here the file is to blame
         raise InputError(f"contradicts itself: {error.message}", file=path) from error

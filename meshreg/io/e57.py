@@ -17,6 +17,7 @@ import numpy as np
 
 from meshreg.errors import InputError, OutputError, UsageError
 from meshreg.io import e57_pages, e57_xml
+from meshreg.io.assemble import Found, placed_survey
 from meshreg.io.crs import crs_text
 from meshreg.io.e57_scans import (
     CARTESIAN,
@@ -34,7 +35,7 @@ from meshreg.io.e57_xml import Layout
 from meshreg.io.frames import Mover, place
 from meshreg.io.options import ReadOptions
 from meshreg.io.rewriting import require_unchanged
-from meshreg.io.safe import atomic_file, fingerprint, open_regular, sha256
+from meshreg.io.safe import atomic_file, open_regular
 from meshreg.types import Float64, PointCloud, SourceFile, Survey, UInt8
 
 log = logging.getLogger("meshreg")
@@ -73,24 +74,9 @@ def read(path: Path, options: ReadOptions) -> Survey:
     for note in notes:
         log.warning("%s: %s", path.name, note)
     placed = place(path, points, options, crs, georeferenced=crs is not None)
-    source = SourceFile(
-        path=path,
-        format="e57",
-        frame=placed.frame,
-        sidecar=placed.sidecar,
-        sha256=sha256(path),
-        fingerprint=fingerprint(path),
-        counts={"points": len(points), "scans": len(layout.scans)},
-    )
-    return Survey(
-        name=placed.name or path.stem,
-        geometry=PointCloud(placed.points, colors),
-        origin=placed.origin,
-        crs=placed.frame.crs,
-        date=placed.date,
-        source=(source,),
-        notes=(*notes, *placed.notes),
-    )
+    geometry = PointCloud(placed.points, colors)
+    found = Found("e57", tuple(notes), counts={"points": len(points), "scans": len(layout.scans)})
+    return placed_survey(path, placed, geometry, found)
 
 
 def _crs(layout: Layout, notes: list[str]) -> str | None:

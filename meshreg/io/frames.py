@@ -8,6 +8,7 @@ coordinates are in.
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -28,12 +29,11 @@ from meshreg.io.crs import (
 from meshreg.io.framing import ENU, NED, UNITS, Y_UP, frame_from
 from meshreg.io.mover import Mover, frame_matrix, make_mover, to_absolute, to_file
 from meshreg.io.options import ReadOptions
+from meshreg.io.precision import single_precision_note
 from meshreg.io.sidecar import SidecarInfo, find_sidecar
 from meshreg.types import Float64, Frame, Maps, Mesh, PointCloud, SourceFile, Survey
 
 _LOG = logging.getLogger("meshreg")
-
-_COLLAPSED = 0.02  # share of points fallen together from which 32-bit steps have spoilt a survey
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +61,7 @@ def place(
     default_axes: Any = None,
     *,
     georeferenced: bool = False,
+    detail: Callable[[], float | None] | None = None,
 ) -> Placed:
     """Do what every reader does with its points: find the sidecar, the frame and a local origin.
 
@@ -75,6 +76,9 @@ def place(
     georeferenced : bool
         The format states absolute coordinates itself (LAS, GeoTIFF): a shift file that speaks for
         a whole folder (offset.xyz, coords.txt, SHIFT.txt) is not meant for it.
+    detail : callable, optional
+        Returns the size of a pixel on the ground, in units of `xyz`; asked only where coordinates
+        went through 32-bit numbers.
 
     Raises
     ------
@@ -87,7 +91,7 @@ def place(
     ends = _ends(xyz)
     if not np.isfinite(ends).all():
         raise InputError(f"has coordinates {ends.tolist()} that are not finite.", file=path)
-    notes = _single_precision_note(path, xyz, ends)
+    notes = single_precision_note(path, xyz, ends, detail)
     sidecar = find_sidecar(path, shared=not georeferenced)
     # The median, because a single stray point must not decide where the survey is.
     centre = np.median(xyz[:: max(1, len(xyz) // 10_000)].astype(np.float64), axis=0)
@@ -137,7 +141,9 @@ def _frame_notes(
     notes: list[str] = []
     if sidecar is not None:
         notes += sidecar.notes
-        if sidecar.shift is not None and options.shift is None:
+        if sidecar.shift is not None and not any(sidecar.shift):
+            pass  # the file's coordinates are absolute: nothing to say
+        elif sidecar.shift is not None and options.shift is None:
             text = ", ".join(f"{value:.12g}" for value in sidecar.shift)
             notes.append(f"The shift ({text}) from {sidecar.shift_name} is added.")
         elif sidecar.shift is not None:
@@ -152,30 +158,6 @@ def _frame_notes(
         if unit != 1 and vertical_part(parse_crs(frame.file_crs)) is None:
             notes.append(f"No unit of heights is stated: they were taken in {unit:.9g} m, too.")
     return tuple(notes)
-
-
-def _single_precision_note(path: Path, xyz: Any, ends: Float64) -> tuple[str, ...]:
-    """Find coordinates that went through 32-bit numbers at large values; refuse collapsed ones.
-
-    Float32 steps by 0.5 m at a UTM northing. A file is refused when its points fell together on
-    such steps; regular grids, which happen to be representable, keep their points apart.
-    """
-    step = float(np.spacing(np.abs(ends[:, :2]).max().astype(np.float32)))
-    if step < 1e-3:
-        return ()
-    sample = np.asarray(xyz[:: max(1, len(xyz) // 200_000), :2], float)
-    with np.errstate(over="ignore"):
-        if not (sample.astype(np.float32) == sample).all():
-            return ()
-    share = 1 - len(np.unique(sample, axis=0)) / len(sample)
-    if share > _COLLAPSED and len(sample) > 100:
-        raise InputError(
-            f"has lost its coordinates to 32-bit numbers: they step by {step:.3g} m, and "
-            f"{share:.0%} of the points coincide with another.",
-            file=path,
-            remedy="Export it in local coordinates with a shift, or with 64-bit numbers.",
-        )
-    return (f"Coordinates are 32-bit numbers that step by {step:.3g} m.",)
 
 
 def reframe(survey: Survey, crs: str) -> Survey:

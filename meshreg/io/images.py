@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from meshreg.errors import InputError, ResourceLimitError, UsageError
-from meshreg.io.safe import atomic_file, copy_file, fingerprint, open_regular
+from meshreg.io.safe import atomic_file, copy_file, fingerprint, free_memory, open_regular
 from meshreg.types import Texture, UInt8
 
 FORMATS = ("JPEG", "PNG", "TIFF", "WEBP")
@@ -280,12 +280,8 @@ def _pixels(image: Any, name: str) -> UInt8:
 
 def _require_memory(needed: int, size: tuple[int, int], name: str) -> None:
     """Refuse to decode what the machine has no room for, where the machine tells."""
-    try:
-        lines = Path("/proc/meminfo").read_text().splitlines()
-        free = next(1024 * int(line.split()[1]) for line in lines if "MemAvailable" in line)
-    except (OSError, StopIteration, ValueError):
-        return
-    if needed > free:
+    free = free_memory()
+    if free is not None and needed > free:
         raise ResourceLimitError(
             f"is {size[0]} x {size[1]} pixels and takes {needed / 1e9:.1f} GB to decode; "
             f"{free / 1e9:.1f} GB are free.",

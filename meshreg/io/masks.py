@@ -28,7 +28,7 @@ from meshreg.io.mask_polygons import (
     read_shapefile,
 )
 from meshreg.io.safe import open_regular
-from meshreg.types import Bool, Float64, Grid
+from meshreg.types import Bool, Float64, Frame, Grid, Survey
 
 log = logging.getLogger("meshreg")
 
@@ -113,7 +113,12 @@ class Mask:
         return replace(self, crs=crs, areas=areas)
 
 
-def read_mask(path: str | Path, invert: bool = False, crs: str | None = None) -> Mask:
+def read_mask(
+    path: str | Path,
+    invert: bool = False,
+    crs: str | None = None,
+    survey: Survey | None = None,
+) -> Mask:
     """Read a mask; its kind is told by its first bytes.
 
     Parameters
@@ -126,6 +131,9 @@ def read_mask(path: str | Path, invert: bool = False, crs: str | None = None) ->
         CRS of the survey; None for a local frame, whose coordinates the mask then shares.
         A GeoJSON without a CRS is in degrees (RFC 7946), unless its numbers cannot be; any other
         file without one is in the survey's CRS.
+    survey : Survey, optional
+        A mask without a CRS that lies apart from this survey, but on it once the shift of the
+        survey's file is added, was drawn in the file's own coordinates, and is read so.
 
     Raises
     ------
@@ -138,7 +146,10 @@ def read_mask(path: str | Path, invert: bool = False, crs: str | None = None) ->
     target = crs_text(crs) if crs else None
     try:
         if head[:4] in geotiff.MAGIC:
-            return Mask(path, target, raster=_read_raster(path), inverted=invert)
+            raster = _read_raster(path)
+            own = raster.crs
+            mask = Mask(path, target, (), replace(raster, crs=own or target), invert)
+            return mask if survey is None else _on_survey(mask, mask, own, survey)
         if head[:4] == b"\x00\x00\x27\x0a":
             areas, own = read_shapefile(path)
         elif head.lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"{"):
@@ -147,12 +158,56 @@ def read_mask(path: str | Path, invert: bool = False, crs: str | None = None) ->
             raise InputError("is no mask that is known.", file=path, remedy=KINDS)
         if not areas:
             raise InputError("holds no polygon.", file=path, remedy=KINDS)
+        placed = areas
         if own is not None and target is not None and own != target:
-            areas = tuple(moved(area, own, target) for area in areas)
+            placed = tuple(moved(area, own, target) for area in areas)
+        mask = Mask(path, target, placed, None, invert)
+        if survey is not None:
+            if head[:4] != b"\x00\x00\x27\x0a":
+                areas, own = read_geojson(path, None)  # its numbers, degrees or not
+            mask = _on_survey(mask, replace(mask, areas=areas), own, survey)
     except MeshregError as error:
         error.file = error.file or str(path)
         raise
-    return Mask(path, target, areas, None, invert)
+    return mask
+
+
+def _on_survey(mask: Mask, as_stored: Mask, own: str | None, survey: Survey) -> Mask:
+    """Return the mask, or the one that its stored numbers are in the survey file's coordinates."""
+    frame = survey.source[0].frame if survey.source else Frame()
+    plain = (frame.axes[:2, :2] == np.eye(2)).all() and frame.is_linear
+    if own is not None or not plain or not frame.shift[:2].any() or _meets(mask, survey):
+        return mask
+    shift = frame.shift[:2]
+    areas = tuple(
+        replace(area, rings=tuple(ring + shift for ring in area.rings)) for area in as_stored.areas
+    )
+    raster = as_stored.raster
+    if raster is not None:
+        raster = replace(raster, matrix=raster.matrix + np.outer(shift, (0, 0, 1)))
+    shifted = replace(as_stored, areas=areas, raster=raster)
+    if not _meets(shifted, survey):
+        return mask
+    text = ", ".join(f"{value:.12g}" for value in shift)
+    log.warning(
+        "%s: taken to be in the file coordinates of %s; its shift (%s) is added.",
+        mask.path,
+        survey.name,
+        text,
+    )
+    return shifted
+
+
+def _meets(mask: Mask, survey: Survey) -> bool:
+    """Whether the mask's extent shares ground with the survey's."""
+    if mask.raster is None:
+        corners = np.concatenate([ring for area in mask.areas for ring in area.rings])
+    else:
+        rows, cols = mask.raster.use.shape
+        ends = np.array([[0, 0, 1], [cols, 0, 1], [0, rows, 1], [cols, rows, 1]], float)
+        corners = ends @ mask.raster.matrix.T
+    low, high = survey.bounds[:, :2]
+    return bool((corners.min(axis=0) <= high).all() and (corners.max(axis=0) >= low).all())
 
 
 def _read_raster(path: Path) -> Raster:

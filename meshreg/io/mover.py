@@ -9,7 +9,7 @@ import numpy as np
 
 from meshreg.errors import UsageError
 from meshreg.io.bridge import bridge
-from meshreg.types import Float64, Frame, SourceFile, Transform
+from meshreg.types import Float64, Frame, SourceFile, Transform, Warp
 
 
 def to_absolute(frame: Frame, xyz: Any) -> Float64:
@@ -52,7 +52,10 @@ class Mover:
     frame : Frame
         Of the file to be written.
     matrix : (4, 4) float64
-        Old file coordinates to new ones: exact unless a CRS changes, else linearised at `centre`.
+        Old file coordinates to new ones: exact unless a CRS changes, else linearised at `centre`;
+        without the warp.
+    warp : Warp or None
+        The bend that follows the transform.
     """
 
     source: Frame
@@ -60,23 +63,30 @@ class Mover:
     frame: Frame
     matrix: Float64
     _turn: Float64 = field(repr=False)
+    warp: Warp | None = None
 
     def points(self, xyz: Any) -> Float64:
         """Move points (N, 3), old file coordinates to new ones."""
-        return to_file(self.frame, self.transform.apply(to_absolute(self.source, xyz)))
+        moved = self.transform.apply(to_absolute(self.source, xyz))
+        return to_file(self.frame, moved if self.warp is None else self.warp.apply(moved))
 
     def directions(self, points: Any, vectors: Any) -> Float64:
         """Turn vectors (N, 3) such as normals, keeping their lengths.
 
-        `points` (where they stand) is part of the contract for a future non-rigid mover; one
-        rotation serves a whole survey here.
+        `points` (where they stand) is part of the contract, though one rotation serves a whole
+        survey: a warp would turn a vector by no more than its strain, under a degree.
         """
         del points
         return np.asarray(np.asarray(vectors, float) @ self._turn.T)
 
 
 def make_mover(
-    source: SourceFile, transform: Transform, target: Frame, *, centre: Any = None
+    source: SourceFile,
+    transform: Transform,
+    target: Frame,
+    *,
+    centre: Any = None,
+    warp: Warp | None = None,
 ) -> Mover:
     """Return the map from the moving file's coordinates to those of the file to be written.
 
@@ -91,6 +101,8 @@ def make_mover(
         Usually `registered_frame(reference, source)`.
     centre : (3,) array, optional
         Where to linearise `matrix`, in the file's own coordinates; needed where a CRS changes.
+    warp : Warp, optional
+        Follows the transform.
     """
     start = source.frame
     if start.crs is not None and target.crs is not None and start.crs != target.crs:
@@ -113,7 +125,7 @@ def make_mover(
         matrix[:3, :3] = np.linalg.inv(after) @ transform.linear @ before
         matrix[:3, 3] = there - matrix[:3, :3] @ here
     turn = _rotation_in(after).T @ transform.rotation @ _rotation_in(before)
-    return Mover(start, transform, target, matrix, turn)
+    return Mover(start, transform, target, matrix, turn, warp)
 
 
 def frame_matrix(frame: Frame) -> Float64:

@@ -87,7 +87,8 @@ def write_record_files(
         if moving is not None and moving.source:
             from meshreg.io import rewrite_survey
 
-            written += rewrite_survey(moving, transform, folder, reference)
+            warp = registration.warp
+            written += rewrite_survey(moving, transform, folder, reference, warp=warp)
     text = to_json(registration_document(registration))
     written.append(_write_text(folder / "registration.json", text))
     return tuple(written)
@@ -144,6 +145,8 @@ def _write_file_transforms(
     transform: Transform, folder: Path, reference: Survey, moving: Survey
 ) -> list[Path]:
     """Write `transform.txt` and its inverse: the moving FILE's coordinates to the reference's.
+
+    A warp is not in them: four lines of four numbers cannot say it.
 
     Blocks of one survey share their frame; where they do not, each other frame gets a pair of
     files of its own, named after its first block.

@@ -239,6 +239,15 @@ def require(
         )
 
 
+def free_memory() -> int | None:
+    """Return the memory [bytes] that can be had without swapping; None where the system is mute."""
+    try:
+        lines = Path("/proc/meminfo").read_text().splitlines()
+        return next(1024 * int(line.split()[1]) for line in lines if "MemAvailable" in line)
+    except (OSError, StopIteration, ValueError):
+        return None
+
+
 def sha256(path: Path) -> str:
     """Return the SHA-256 of a file in hexadecimal."""
     with open_regular(path) as stream:
@@ -291,6 +300,7 @@ __all__: list[str] = [
     "decode_name",
     "file_bytes",
     "fingerprint",
+    "free_memory",
     "open_regular",
     "require",
     "resolve_reference",

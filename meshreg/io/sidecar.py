@@ -123,6 +123,8 @@ def _candidates(path: Path, shared: bool) -> Iterator[tuple[Path, Any]]:
         yield folder / f"{name}_offset.xyz", _read_offset
         yield folder / f"{name}.prj", _read_prj
         yield folder / f"{name}_wkt.prj", _read_prj
+        for suffix in (".rcInfo", ".rcinfo"):
+            yield folder / f"{name}{suffix}", _tell_rcinfo
     if not shared:
         return
     yield folder / "offset.xyz", _read_offset
@@ -236,6 +238,18 @@ def _read_offset(path: Path) -> SidecarInfo | None:
 def _read_prj(path: Path) -> SidecarInfo:
     """Read a .prj: one CRS as WKT, of ESRI's kind or another."""
     return _located(path, None, " ".join(_lines(path)))
+
+
+def _tell_rcinfo(path: Path) -> SidecarInfo:
+    """Tell of RealityCapture's file: it holds the way to the model's CRS, in a form not published.
+
+    https://rchelp.capturingreality.com/en-US/tools/export.htm
+    """
+    note = (
+        f"{path.name} (RealityCapture) may say where the coordinates are, but is not read: if they "
+        "are shifted, give the shift (--reference-shift, --moving-shift, or a .survey.toml)."
+    )
+    return SidecarInfo(notes=(note,))
 
 
 def _read_shift_txt(path: Path) -> SidecarInfo:

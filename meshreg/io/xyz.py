@@ -9,16 +9,16 @@ from pathlib import Path
 import numpy as np
 
 from meshreg.errors import InputError
-from meshreg.io.assemble import eight_bit_colors
+from meshreg.io.assemble import Found, eight_bit_colors, placed_survey
 from meshreg.io.cloud import without_strays
 from meshreg.io.frames import ENU, place
 from meshreg.io.options import ReadOptions
-from meshreg.io.safe import file_bytes, fingerprint, sha256
+from meshreg.io.safe import file_bytes
 from meshreg.io.sidecar import find_sidecar
 from meshreg.io.xyz_layout import Layout, read_layout
 from meshreg.io.xyz_values import read_values, wanted_columns
 from meshreg.io.xyz_write import rewrite, write
-from meshreg.types import Float64, PointCloud, SourceFile, Survey, UInt8
+from meshreg.types import Float64, PointCloud, Survey, UInt8
 
 __all__ = ["read", "rewrite", "write"]
 
@@ -65,24 +65,9 @@ def read(path: Path, options: ReadOptions) -> Survey:
     crs = "EPSG:4326" if layout.lonlat and not _crs_is_said(path, options) else None
     axes = _Z_DOWN if layout.down else ENU
     placed = place(path, points, options, crs, axes)
-    source = SourceFile(
-        path=path,
-        format="xyz",
-        frame=placed.frame,
-        sidecar=placed.sidecar,
-        sha256=sha256(path),
-        fingerprint=fingerprint(path),
-        counts={"points": n_rows, "used": len(points)},
-    )
-    return Survey(
-        name=placed.name or path.stem,
-        geometry=PointCloud(placed.points, colors),
-        origin=placed.origin,
-        crs=placed.frame.crs,
-        date=placed.date,
-        source=(source,),
-        notes=(*notes, *placed.notes),
-    )
+    geometry = PointCloud(placed.points, colors)
+    found = Found("xyz", tuple(notes), counts={"points": n_rows, "used": len(points)})
+    return placed_survey(path, placed, geometry, found)
 
 
 def _crs_is_said(path: Path, options: ReadOptions) -> bool:

@@ -27,7 +27,7 @@ def page_spans(uv: Float32, face_page: Int32, n_pages: int) -> Float64:
                         value = uv[f, corner, k]
                         parts[part, page, 0, k] = min(parts[part, page, 0, k], value)
                         parts[part, page, 1, k] = max(parts[part, page, 1, k], value)
-    spans = parts[0].copy()
+    spans: Float64 = parts[0].copy()
     for part in range(1, n_parts):
         spans[:, 0] = np.minimum(spans[:, 0], parts[part, :, 0])
         spans[:, 1] = np.maximum(spans[:, 1], parts[part, :, 1])

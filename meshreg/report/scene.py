@@ -78,7 +78,7 @@ def draw_scene(registration: Registration, path: Path, seconds: float) -> Path |
                 _death(done.returncode, done.stderr),
             )
             return None
-        _save(np.load(picture), path)
+        _save(np.load(picture), path, float(arrays["exaggeration"]))
     return path
 
 
@@ -88,7 +88,7 @@ def _death(code: int, said: str) -> str:
     return (said.strip().splitlines() or [f"exit code {code}"])[-1]
 
 
-def _save(picture: Any, path: Path) -> None:
+def _save(picture: Any, path: Path, exaggeration: float = 1.0) -> None:
     """Crop both halves alike to what they show, and write them side by side with their names."""
     from PIL import Image, ImageDraw
 
@@ -106,7 +106,8 @@ def _save(picture: Any, path: Path) -> None:
     canvas = Image.new("RGB", (image.width, image.height + 30), "white")
     canvas.paste(image, (0, 30))
     draw = ImageDraw.Draw(canvas)
-    for column, name in enumerate(("reference", "registered")):
+    raised = f", heights × {exaggeration:.1f}" if exaggeration > 1.0 else ""
+    for column, name in enumerate((f"reference{raised}", f"registered{raised}")):
         draw.text((12 + column * image.width // 2, 8), name, fill="black", font_size=18)
     canvas.save(path, format="PNG")
 
@@ -125,8 +126,8 @@ def _arrays(registration: Registration) -> dict[str, Any] | None:
     rows, cols = grid.shape
     low, high = np.nanpercentile(height - base, [2, 98])
     relief = max(float(high - low), 1e-6)
-    # Flat ground would show as a plate: relief is raised to a tenth of the width, never lowered.
-    exaggeration = max(1.0, min(20.0, 0.1 * max(rows, cols) * grid.cell / relief))
+    # Flat ground would show as a plate: relief is raised to a part of the width, never lowered.
+    exaggeration = max(1.0, min(20.0, 0.04 * max(rows, cols) * grid.cell / relief))
     colors = [
         _color_at(evidence.get(key), relief_map, grid)
         for key, relief_map in (("reference_ortho", height), ("moving_ortho", moved))

@@ -20,11 +20,13 @@ METHOD_STYLES = {
     "sift": ("#E69F00", "o"),
     "terrain": ("#0072B2", "s"),
     "mutual_information": ("#CC79A7", "D"),
+    "ties": ("#56B4E9", "^"),
 }
 METHOD_NAMES = {
     "sift": "SIFT",
     "terrain": "terrain scan",
     "mutual_information": "mutual information",
+    "ties": "tie points",
 }
 DPI = 130
 MAX_PIXELS = 2000  # longest side of a picture

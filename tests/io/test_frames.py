@@ -461,6 +461,35 @@ def test_a_regular_grid_in_32_bits_is_kept_and_said():
     assert len(np.unique(placed.points, axis=0)) == 1600
 
 
+@pytest.mark.parametrize(
+    ("pixel", "kept"), [(0.02, False), (1.9, False), (2.1, True), (None, True)]
+)
+def test_32_bit_steps_must_not_tear_a_texture(pixel, kept):
+    """Points a few metres apart keep their places, but a texture of centimetres does not."""
+    rng = np.random.default_rng(2)
+    sparse = rng.uniform(0, 200, (2000, 3)) + np.array([731_000.0, 5_705_000.0, 0.0])
+    asked = []
+
+    def detail():
+        asked.append(pixel)
+        return pixel
+
+    path = Path("none/a.ply")
+    if kept:
+        placed = place(path, sparse.astype(np.float32), ReadOptions(), detail=detail)
+        assert "step by 0.5 m" in placed.notes[0]
+    else:
+        with pytest.raises(InputError, match=rf"step by 0\.5 m, but .* pixels are {pixel} m"):
+            place(path, sparse.astype(np.float32), ReadOptions(), detail=detail)
+    assert asked == [pixel]
+    # Nothing went through 32 bits, or what did lies on a grid of metres: nothing is torn.
+    assert place(path, sparse, ReadOptions(), detail=detail).notes == ()
+    east, north = np.meshgrid(731_000.0 + np.arange(40), 5_705_000.0 + np.arange(40))
+    grid = np.stack([east.ravel(), north.ravel(), np.zeros(1600)], axis=1).astype(np.float32)
+    assert len(place(path, grid, ReadOptions(), detail=detail).points) == 1600
+    assert len(asked) == 2
+
+
 # --- movers
 
 

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import os
+import re
+import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 import laspy
 import numpy as np
 import pytest
+from PIL import Image
 
 from meshreg.errors import InputError, OutputError, UnsafeReferenceError, UsageError
 from meshreg.io import (
@@ -26,6 +30,7 @@ from meshreg.io import (
 from meshreg.io.merging import merge
 from meshreg.types import Mesh, PointCloud, Survey, Texture, Transform
 
+DATA = Path(__file__).parent.parent / "data"
 SQUARE = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0.5], [0, 1, 0.25]])
 FACES = np.array([[0, 1, 2], [0, 2, 3]])
 
@@ -336,11 +341,12 @@ def test_blocks_that_do_not_fit_are_refused(tmp_path):
 
 def test_colours_of_some_blocks_only_are_left_out_and_said(tmp_path):
     las(tmp_path / "a.las", colors=[[10, 20, 30]] * 4)
-    las(tmp_path / "b.las")
+    beside = np.add(SQUARE, (5, 0, 0))
+    las(tmp_path / "b.las", beside)
     survey = read_survey(tmp_path)
     assert survey.geometry.colors is None
     assert any("only 1 of 2 files" in note for note in survey.notes)
-    las(tmp_path / "b.las", colors=[[40, 50, 60]] * 4)
+    las(tmp_path / "b.las", beside, colors=[[40, 50, 60]] * 4)
     assert read_survey(tmp_path).geometry.colors.tolist() == [[10, 20, 30]] * 4 + [[40, 50, 60]] * 4
 
 
@@ -406,7 +412,8 @@ def test_a_file_that_changes_while_it_is_read_is_noticed(tmp_path, monkeypatch):
 def test_a_file_that_belongs_to_a_survey_is_noticed_too(tmp_path, kind):
     if kind in ("material", "page"):
         path = tmp_path / "reef.obj"
-        path.write_text("mtllib a.mtl\nusemtl m\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nf 1/1 2/1 3/1\n")
+        vertices = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\n"
+        path.write_text(f"mtllib a.mtl\nusemtl m\n{vertices}f 1/1 2/1 3/1\n")
         (tmp_path / "a.mtl").write_text("newmtl m\nmap_Kd a.png\n")
         Image.new("RGB", (4, 4), (1, 2, 3)).save(tmp_path / "a.png")
         other = tmp_path / ("a.mtl" if kind == "material" else "a.png")

@@ -17,7 +17,7 @@ from rasterio import Affine
 
 from meshreg.errors import InputError
 from meshreg.io import mask_polygons, masks
-from meshreg.types import Grid
+from meshreg.types import Frame, Grid, PointCloud, SourceFile, Survey
 
 CRS = "EPSG:32754"
 # Corners that lie on no cell centre and on no line through them.
@@ -252,6 +252,64 @@ def test_raster_mask_of_floats_and_in_another_crs(tmp_path):
     mask = masks.read_mask(write_raster(tmp_path / "m.tif", values, "EPSG:32753", affine), crs=CRS)
     east, north = there.transform(np.array([x, x]), np.array([y + 50, y - 50]), direction="INVERSE")
     assert mask.at(east, north).tolist() == [False, True]
+
+
+def shifted_survey(crs=None):
+    """20 m of ground around (0, 0) of its file, which a shift takes to (500000, 6000000)."""
+    frame = Frame(np.eye(3), [500000.0, 6000000.0, 0.0], crs, crs)
+    points = np.array([[-3.0, -2.0, 0.0], [20.0, 14.0, 1.0]])
+    source = SourceFile(Path("reef.obj"), "obj", frame)
+    return Survey("reef", PointCloud(points), frame.shift, crs=crs, source=(source,))
+
+
+@pytest.mark.parametrize("crs", [None, CRS])
+@pytest.mark.parametrize("kind", ["geojson", "shp", "tif"])
+def test_a_mask_in_the_files_own_coordinates(tmp_path, caplog, kind, crs):
+    """Drawn on the file as it is seen in CloudCompare, or in absolute coordinates: the same."""
+    survey = shifted_survey(crs)
+    grid = Grid(FAR_GRID.west, FAR_GRID.north, 0.1, FAR_GRID.shape, crs)
+    found = []
+    for shift in (0.0, 1.0):
+        ring = [[x + 500000.0 * shift, y + 6000000.0 * shift] for x, y in OUTER]
+        path = tmp_path / f"m{shift}.{kind}"
+        if kind == "geojson":
+            write_json(path, feature(ring))
+        elif kind == "shp":
+            with shapefile.Writer(path) as writer:
+                writer.field("a", "C")
+                writer.poly([closed(ring)])
+                writer.record("x")
+        else:
+            values = np.zeros((20, 30), np.uint8)
+            values[4:9, 5:20] = 1
+            corner = Affine(1.0, 0, 500000 * shift - 3, 0, -1.0, 6000000 * shift + 14)
+            write_raster(path, values, None, corner)
+        caplog.clear()
+        found.append(masks.read_mask(path, crs=crs, survey=survey)(grid))
+        assert ("file coordinates of reef" in caplog.text) == (shift == 0)
+    np.testing.assert_array_equal(found[0], found[1])
+    assert 0.1 < found[0].mean() < 0.9
+    # A mask that states its CRS is taken at its word, and so is one of a survey without shift.
+    caplog.clear()
+    if kind == "geojson":
+        name = {"crs": {"type": "name", "properties": {"name": CRS}}}
+        path = write_json(tmp_path / "own.geojson", feature(OUTER), **name)
+        assert not masks.read_mask(path, crs=crs, survey=survey)(grid).any()
+    plain = Survey("plain", PointCloud(np.array([[0.0, 0, 0], [9, 9, 0]])))
+    masks.read_mask(tmp_path / f"m0.0.{kind}", survey=plain)
+    assert "file coordinates" not in caplog.text
+
+
+def test_a_raster_without_crs_keeps_its_place_when_its_frame_changes(tmp_path):
+    """Made in the moving survey's zone, asked in the reference's."""
+    from pyproj import Transformer
+
+    values = np.zeros((20, 20), np.uint8)
+    values[:10] = 1
+    mask = masks.read_mask(write_raster(tmp_path / "m.tif", values, None), crs=CRS)
+    there = Transformer.from_crs(CRS, "EPSG:32753", always_xy=True)
+    east, north = there.transform([500005.0, 500005.0], [6000008.5, 5999999.5])
+    assert mask.to("EPSG:32753").at(east, north).tolist() == [True, False]
 
 
 @pytest.mark.parametrize(

@@ -119,6 +119,20 @@ def test_metashape_shift_txt(survey, name, text, crs):
     assert frame_from(ReadOptions(), found, centre=CENTRE).crs == crs
 
 
+@pytest.mark.parametrize("suffix", [".rcInfo", ".rcinfo"])
+def test_a_realitycapture_file_is_told(tmp_path, suffix):
+    (tmp_path / f"reef{suffix}").write_text("<ModelExport/>")
+    said = find_sidecar(tmp_path / "reef.obj")
+    assert said.shift is None
+    assert f"reef{suffix}" in said.notes[0]
+    assert "--moving-shift" in said.notes[0]
+    (tmp_path / "reef_offset.xyz").write_text("731000 5705000 0")
+    said = find_sidecar(tmp_path / "reef.obj")
+    assert said.shift == (731000, 5705000, 0)
+    assert len(said.notes) == 1
+    assert find_sidecar(tmp_path / "other.obj") is None
+
+
 def test_our_own_toml_says_everything(survey):
     survey.with_suffix(".survey.toml").write_text(
         'name = "Reef, first dive"\ndate = 2018-06-01\ncrs = "EPSG:32754"\n'

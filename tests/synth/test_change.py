@@ -66,7 +66,8 @@ def test_each_class_changes_its_polygons_and_nothing_else(name):
     if name == "sediment":  # the sand that was there rises or falls as well
         polygons += described["fields"]["sand"]["polygons"]
     inside = within(polygons, scene, x, y)
-    assert not (differs & ~inside).any()
+    # (slivers of sand narrower than the polygons' step may be missed)
+    assert (differs & ~inside).sum() <= (5 if name == "sediment" else 0)
     # and most regions do show it (some lie under another thing)
     shows = [
         differs[within([region["polygon"]], scene, x, y)].any()
@@ -93,10 +94,12 @@ def test_ripples_change_the_sand_alone():
     assert 0.001 < np.abs(rise[differs]).mean() < 0.05
 
 
-def test_texture_changes_colour_everywhere_and_no_height():
+def test_texture_changes_colour_everywhere_and_relief_by_the_size_of_rubble():
     scene = scene_with(texture=0.7)
     _, _, rise, differs = sampled(scene)
-    assert np.abs(rise).max() == 0.0
+    assert np.abs(rise).max() < 0.06
+    assert np.abs(rise).mean() < 0.006
+    assert abs(rise.mean()) < 0.001
     bare = scene.reference.seafloor.features["kind"]
     assert len(bare)
     assert differs.mean() > 0.4

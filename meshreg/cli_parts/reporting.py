@@ -1,0 +1,77 @@
+"""`meshreg report` and `meshreg view`; the page that `meshreg register` writes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rich.markup import escape
+
+from meshreg.cli_parts.console import Voice
+from meshreg.errors import InputError
+
+if TYPE_CHECKING:
+    from meshreg.types import Registration
+
+
+def keep_evidence(registration: Registration, folder: Path) -> None:
+    """Save in a result's folder what its page needs beyond the record."""
+    from meshreg.io.evidence import write_evidence
+    from meshreg.report import keep
+
+    if kept := keep(registration):
+        write_evidence(kept, folder)
+
+
+def write_report(folder: Path) -> Path:
+    """Make a result's page from what is in its folder, whole or not at all.
+
+    Raises
+    ------
+    InputError
+        If there is no result in the folder, or its record or evidence is damaged.
+    OutputError
+        If the page cannot be written.
+    """
+    from meshreg.io.atomic import atomic_file
+    from meshreg.io.evidence import read_evidence
+    from meshreg.io.record import read_registration
+    from meshreg.report import gather, report_page
+
+    folder = _result_folder(folder)
+    result = gather(read_registration(folder), read_evidence(folder), folder)
+    path = folder / "report.html"
+    with atomic_file(path) as partial:
+        partial.write_text(report_page(result), encoding="utf-8")
+    return path
+
+
+def _result_folder(folder: Path) -> Path:
+    folder = Path(folder)
+    if not (folder / "registration.json").is_file():
+        raise InputError(
+            "holds no registration.json.",
+            file=folder,
+            remedy="Give the folder that `meshreg register` wrote.",
+        )
+    return folder
+
+
+def view(folder: Path) -> None:
+    """Show both surfaces of a result in a window; return when it is closed."""
+    from meshreg.io.evidence import read_evidence
+    from meshreg.report import open_view
+
+    folder = _result_folder(folder)
+    open_view(read_evidence(folder), folder)
+
+
+def document(page: Path) -> dict[str, Any]:
+    """Return what `meshreg report --json` prints."""
+    return {"schema": "meshreg.report/1", "report": str(page), "bytes": page.stat().st_size}
+
+
+def show(page: Path, voice: Voice) -> None:
+    """Say where the page is."""
+    size = page.stat().st_size / 1e6
+    voice.say(f"Written: [bold]{escape(str(page))}[/] ({size:.1f} MB). Open it in a browser.")

@@ -1,0 +1,114 @@
+"""A survey that was turned first: by which motion, the whole answer, and what to say of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from meshreg.judge import Judgement
+from meshreg.refine import Refined
+from meshreg.settings import SearchSettings
+from meshreg.tiles import MAX_YAW
+from meshreg.types import Float64, SurveyRaster, Transform
+from meshreg.voting import SMALL_YAW, Turn, similarity, vote
+
+Pairs = dict[str, tuple[SurveyRaster, SurveyRaster]]
+Turned = Callable[[Turn], tuple[Pairs, Transform]]
+LEAST_TILES = 12  # for a scale of their own
+
+
+def turning(turn: Turn, centre: Float64) -> Transform:
+    """Return the motion about `centre` (3,) [m] that a vote asks for."""
+    c, s = np.cos(turn.yaw), np.sin(turn.yaw)
+    rotation = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    return Transform(rotation, turn.scale, np.zeros(3), centre)
+
+
+def turned_as_voted(
+    pairs: Pairs, turn: Turn, turned: Turned, settings: SearchSettings, radius: float
+) -> tuple[Pairs, Transform]:
+    """Turn the moving survey; the tiles of a survey that was far off are asked for its scale anew.
+
+    Parameters
+    ----------
+    pairs : mapping
+        "dem" and "ortho" to (reference, moving), as delivered.
+    turn : Turn
+        What their tiles vote for.
+    turned : callable
+        ``turned(turn)`` makes the rasters of the turned survey, and says by which motion.
+    settings : SearchSettings
+    radius : float
+        Half width of the search window [m].
+    """
+    if abs(turn.yaw) <= SMALL_YAW:
+        return turned(turn)
+    # unturned tiles run off their peaks, which by itself feigns a scale of a per cent
+    upright = turned(replace(turn, scale=1.0))
+    again = vote(upright[0], settings, radius)
+    if again is None or again.scale == 1.0:
+        return upright
+    return turned(replace(turn, yaw=turn.yaw + again.yaw, scale=again.scale))
+
+
+def on_heading_and_scale(
+    judgement: Judgement, yaw: float, scale: float, settings: SearchSettings, turn: Turn | None
+) -> tuple[Judgement, tuple[str, ...]]:
+    """Doubt a survey whose scale is plainly wrong, and tell what its heading is off by.
+
+    `yaw` [rad] and `scale` are those of the whole answer.
+    """
+    notes: tuple[str, ...] = ()
+    if abs(yaw) > MAX_YAW:
+        notes += (
+            f"the moving survey's heading is off: it was turned by {np.rad2deg(yaw):+.2f}° about "
+            "its centre before the search, and the methods' offsets are those of the turned survey",
+        )
+    if settings.free_scale and scale != 1.0:
+        notes += (f"the moving survey's lengths are multiplied by {scale:.5f}",)
+    elif scale != 1.0:
+        said = f"the moving survey is {_missized(scale)}: check the scale bars"
+        judgement = judgement.doubted(said)
+    elif turn is not None and turn.mimics_scale:
+        notes += (
+            f"the moving survey seems {_missized(turn.stretch)}, which internal distortion "
+            "can feign; its scale was left as it is",
+        )
+    return judgement, notes
+
+
+def _missized(scale: float) -> str:
+    """Tell in words what multiplying lengths by `scale` mends."""
+    return f"{100 * abs(1 / scale - 1):.1f} % too {'small' if scale > 1 else 'large'}"
+
+
+def tile_scale(refined: Refined) -> float:
+    """Return the scale that the refined tiles speak for; 1 where they are too few."""
+    tiles = refined.tiles
+    if tiles is None or len(tiles.places) < LEAST_TILES:
+        return 1.0
+    found = similarity(tiles.places - refined.pivot, tiles.offsets, 1e-4)
+    return 1.0 if found is None else found[2]
+
+
+def as_delivered(refined: Refined, motion: Transform) -> Refined:
+    """Put the answer for the turned survey and the turn together: one from the delivered one."""
+
+    def back(places: Float64) -> Float64:
+        points = np.column_stack([places, np.full(len(places), motion.pivot[2])])
+        return motion.inverse().apply(points)[:, :2]
+
+    pivot = back(refined.pivot[None])[0]
+    tiles = refined.tiles
+    if tiles is not None:
+        places = back(tiles.places)
+        tiles = replace(tiles, places=places, offsets=tiles.places + tiles.offsets - places)
+    return replace(
+        refined,
+        pivot=pivot,
+        offset=refined.pivot + refined.offset - pivot,
+        yaw=refined.yaw + float(np.arctan2(motion.rotation[1, 0], motion.rotation[0, 0])),
+        tiles=tiles,
+    )

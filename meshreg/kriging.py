@@ -1,0 +1,259 @@
+"""The rigid motion that fits a whole overlap best, from the offsets of some of its tiles.
+
+Two models of one place differ by a rigid motion and by a smooth internal warp. What is asked for
+is the rigid motion that fits all of the overlap best, by uniform least squares; what is known are
+the offsets of tiles, which cover it unevenly and err. With the warp as a random field, whose size
+and range the tiles themselves tell, the answer and its covariance follow by block kriging
+(universal kriging of a linear functional; Cressie, Statistics for Spatial Data, 1993, sections
+3.4 and 2.6): a tile weighs by how much of the overlap it speaks for, tiles that stand close share
+their warp, and ground without tiles adds to the doubt.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from meshreg.types import Bool, Float64
+
+RANGES = (0.1, 0.2, 0.4, 0.8, 1.6)  # of the warp, in diagonals of the tiles' places
+# Of the warp in the variance. Never all of it: a tile is not the smooth warp itself, since the
+# relief that tells its offset is spread unevenly over it, and the warp bends within it.
+SHARES = (0.0, 0.2, 0.5, 0.8, 0.95, 0.99)
+MOST_TILES = 300  # that the warp's size and range are estimated from
+OUTLIER = 18.4  # squared deviations of two axes: chance 1e-4
+
+
+@dataclass(frozen=True, eq=False)
+class Ground:
+    """The overlap: places (G, 2) [m] that stand for it, and the share of its area of each (G,)."""
+
+    places: Float64
+    share: Float64
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """A rigid motion in the plane.
+
+    Attributes
+    ----------
+    answer : (k,) float64
+        East and north [m] at the pivot; the turn [rad] too where it was sought.
+    covariance : (k, k) float64
+    used : (M,) bool
+        False where a tile lies far from what its neighbours say.
+    noise, warp : float
+        Deviation [m] per axis of a tile's error, and of the internal warp.
+    field : Field
+        The warp itself.
+    """
+
+    answer: Float64
+    covariance: Float64
+    used: Bool
+    noise: float
+    warp: float
+    field: Field
+
+
+@dataclass(frozen=True, eq=False)
+class Field:
+    """Most likely offset at any place: the rigid part and the warp, as the tiles tell them."""
+
+    places: Float64
+    pivot: Float64
+    answer: Float64
+    weights: Float64
+    reach: float
+
+    def __call__(self, places: Float64) -> Float64:
+        """Offset (N, 2) [m] at places (N, 2)."""
+        rigid = design(places, self.pivot, yaw_free=len(self.answer) == 3) @ self.answer
+        return np.asarray(rigid + correlation(places, self.places, self.reach) @ self.weights)
+
+    def growth(self, places: Float64) -> Float64:
+        """(N,) area in the reference for a unit of area at places in the moving survey."""
+        step = 0.01 * self.reach
+        ends = [(self(places + s) - self(places - s)) / (2 * step) for s in step * np.eye(2)]
+        return np.asarray(np.linalg.det(np.eye(2) + np.stack(ends, axis=2)))
+
+
+def best_motion(
+    places: Float64,
+    offsets: Float64,
+    ground: Ground,
+    pivot: Float64,
+    *,
+    yaw_free: bool,
+    start: Motion | None = None,
+) -> Motion:
+    """Find the rigid motion that fits all of the ground best; leave out tiles that stand alone.
+
+    Parameters
+    ----------
+    places, offsets : (M, 2) float64
+        Where the tiles are, and how far each must go [m].
+    ground : Ground
+    pivot : (2,) float64
+        Where the offset is stated [m].
+    yaw_free : bool
+        Whether a turn is sought too.
+    start : Motion, optional
+        Whose tiles are used as they are.
+    """
+    if start is not None:
+        return _krige(places, offsets, start.used, ground, pivot, yaw_free=yaw_free)[0]
+    used = _near_neighbours(places, offsets)
+    for _ in range(5):
+        before = used
+        motion, used = _krige(places, offsets, used, ground, pivot, yaw_free=yaw_free)
+        if (used == before).all():
+            break
+    return motion
+
+
+def design(places: Float64, pivot: Float64, *, yaw_free: bool) -> Float64:
+    """(M, 2, k) float64: what each parameter does to the offset at each place."""
+    arm = places - pivot
+    columns = np.zeros((len(arm), 2, 3 if yaw_free else 2))
+    columns[:, 0, 0] = columns[:, 1, 1] = 1.0
+    if yaw_free:
+        columns[:, 0, 2], columns[:, 1, 2] = -arm[:, 1], arm[:, 0]
+    return columns
+
+
+def correlation(first: Float64, second: Float64, reach: float) -> Float64:
+    """(M, N) Matérn correlation of smoothness 5/2 between places."""
+    away = np.sqrt(((first[:, None] - second[None]) ** 2).sum(axis=2)) * (np.sqrt(5) / reach)
+    return np.asarray((1 + away + away**2 / 3) * np.exp(-away))
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """Generalised least squares of the tiles' offsets at one reach and share of the warp."""
+
+    reach: float
+    share: float
+    inverse: Float64  # (M, M), of the covariance of one axis in units of `variance`
+    normal: Float64  # (k, k)
+    answer: Float64  # (k,)
+    left: Float64  # (M, 2)
+    variance: float
+    cost: float  # -2 ln of the restricted likelihood
+
+    @classmethod
+    def of(
+        cls, offsets: Float64, drift: Float64, alike: Float64, reach: float, share: float
+    ) -> _Fit:
+        covariance = share * alike
+        covariance[np.diag_indices(len(alike))] = 1.0
+        inverse = np.asarray(np.linalg.inv(covariance), np.float64)
+        weighed = np.tensordot(inverse, drift, 1)
+        normal = np.einsum("mik,mil->kl", drift, weighed)
+        answer = np.linalg.solve(normal, np.einsum("mik,mi->k", weighed, offsets))
+        left = offsets - drift @ answer
+        freedom = offsets.size - len(answer)
+        variance = float((left * (inverse @ left)).sum()) / freedom
+        variance = max(variance, 1e-24)
+        volume = 2 * np.linalg.slogdet(covariance)[1] + np.linalg.slogdet(normal)[1]
+        cost = freedom * np.log(variance) + volume
+        return cls(reach, share, inverse, normal, answer, left, variance, float(cost))
+
+
+def _krige(
+    places: Float64,
+    offsets: Float64,
+    used: Bool,
+    ground: Ground,
+    pivot: Float64,
+    *,
+    yaw_free: bool,
+) -> tuple[Motion, Bool]:
+    """Average over all likely reaches and shares of the warp; also tell which tiles fit."""
+    here, there = places[used], offsets[used]
+    drift = design(here, pivot, yaw_free=yaw_free)
+    diagonal = float(np.hypot(*np.ptp(places, axis=0)))
+    thin = slice(None, None, -(-len(here) // MOST_TILES))
+    tries = []
+    for reach in diagonal * np.array(RANGES):
+        alike = correlation(here[thin], here[thin], reach)
+        for share in SHARES if reach == diagonal * RANGES[0] else SHARES[1:]:
+            tries.append(_Fit.of(there[thin], drift[thin], alike, float(reach), share))
+    odds = np.exp(-0.5 * (np.array([t.cost for t in tries]) - min(t.cost for t in tries)))
+    odds /= odds.sum()
+    found = []
+    for weight, fit in zip(odds, tries, strict=True):
+        if weight > 1e-3:
+            whole = fit
+            if len(here[thin]) < len(here):
+                alike = correlation(here, here, fit.reach)
+                whole = _Fit.of(there, drift, alike, fit.reach, fit.share)
+            found.append((weight, whole, *_over_ground(whole, here, drift, ground, pivot)))
+    total = sum(weight for weight, *_ in found)
+    answer = sum(weight * a for weight, _, a, _ in found) / total
+    covariance = sum(w * (c + np.outer(a - answer, a - answer)) for w, _, a, c in found) / total
+    best = max(found, key=lambda entry: entry[0])[1]
+    noise, warp = (np.sqrt(best.variance * part) for part in (1 - best.share, best.share))
+    weights = best.share * best.inverse @ best.left
+    field = Field(here, pivot, best.answer, weights, best.reach)
+    motion = Motion(answer, covariance, used, float(noise), float(warp), field)
+    return motion, _fitting(best, places, offsets, used, pivot)
+
+
+def _over_ground(
+    fit: _Fit, places: Float64, drift: Float64, ground: Ground, pivot: Float64
+) -> tuple[Float64, Float64]:
+    """Best motion over the ground, drift and warp together, and its covariance."""
+    over = design(ground.places, pivot, yaw_free=drift.shape[2] == 3)
+    area = ground.share[:, None, None]
+    normal = np.einsum("gik,gil->kl", over, area * over)
+    # (2, k, G): what a field at each place, along each axis, does to the answer
+    weights = np.linalg.solve(normal, (area * over).reshape(-1, over.shape[2]).T)
+    weights = weights.reshape(over.shape[2], len(over), 2).transpose(2, 0, 1)
+    near = fit.share * correlation(ground.places, places, fit.reach)
+    within = fit.share * correlation(ground.places, ground.places, fit.reach)
+    known = weights @ near  # (2, k, M): covariance of the answer with each tile
+    gain = known @ fit.inverse
+    answer = fit.answer + sum(gain[axis] @ fit.left[:, axis] for axis in (0, 1))
+    rest = np.eye(drift.shape[2]) - sum(gain[axis] @ drift[:, axis] for axis in (0, 1))
+    covariance = rest @ np.linalg.solve(fit.normal, rest.T)
+    for axis in (0, 1):
+        covariance += weights[axis] @ within @ weights[axis].T - gain[axis] @ known[axis].T
+    return answer, fit.variance * 0.5 * (covariance + covariance.T)
+
+
+def _fitting(fit: _Fit, places: Float64, offsets: Float64, used: Bool, pivot: Float64) -> Bool:
+    """Tell which tiles lie where all the others, drift and warp, expect them."""
+    here = places[used]
+    yaw_free = len(fit.answer) == 3
+    drift = design(here, pivot, yaw_free=yaw_free)
+    weighed = np.tensordot(fit.inverse, drift, 1)
+    # leave-one-out (Dubrule, Mathematical Geology 15, 1983): (P d)_m / P_mm, of variance s²/P_mm
+    inner = np.diag(fit.inverse)[:, None] - np.einsum(
+        "mik,kl,mil->mi", weighed, np.linalg.inv(fit.normal), weighed
+    )
+    alone = fit.inverse @ fit.left
+    deviation = (alone**2 / np.maximum(inner, 1e-12)).sum(axis=1) / fit.variance
+    scale = max(float(np.median(deviation)) / (2 * np.log(2)), 1e-12)
+    # the left-out ones are judged from the kept ones, as any other place would be
+    result = np.zeros(len(used), bool)
+    result[used] = deviation <= OUTLIER * scale
+    out = ~used
+    if out.any():
+        near = fit.share * correlation(places[out], here, fit.reach)
+        expected = design(places[out], pivot, yaw_free=yaw_free) @ fit.answer
+        expected += near @ alone
+        variance = 1.0 - ((near @ fit.inverse) * near).sum(axis=1)
+        away = ((offsets[out] - expected) ** 2).sum(axis=1)
+        result[out] = away <= OUTLIER * scale * fit.variance * np.maximum(variance, 1e-12)
+    return result if result.sum() >= 0.5 * used.sum() else used
+
+
+def _near_neighbours(places: Float64, offsets: Float64) -> Bool:
+    """Tell which tiles lie near the median of their eight neighbours: a start without outliers."""
+    away = ((places[:, None] - places[None]) ** 2).sum(axis=2)
+    nearest = np.argsort(away, axis=1, kind="stable")[:, 1:9]
+    apart = np.hypot(*(offsets - np.median(offsets[nearest], axis=1)).T)
+    return np.asarray(apart <= 4 * max(float(np.median(apart)), 1e-9))

@@ -1,0 +1,55 @@
+"""What a page is made from: the finished record, what was kept, and what lies in its folder."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from meshreg.types import Registration
+
+PAGE = "report.html"
+
+
+@dataclass(frozen=True)
+class Result:
+    """A finished registration as the page's sections see it.
+
+    Attributes
+    ----------
+    registration : Registration
+        As it was read; its own evidence is not looked at.
+    kept : mapping
+        What `meshreg.report.keep` kept, "meta" as a dictionary; may be empty.
+    files : sequence of (name, bytes)
+        What lies beside the page, by its relative path.
+    log : str
+    still : bytes
+        A PNG of the 3-D scene; may be empty.
+    """
+
+    registration: Registration
+    kept: Mapping[str, Any]
+    files: Sequence[tuple[str, int]] = ()
+    log: str = ""
+    still: bytes = b""
+
+
+def gather(registration: Registration, kept: Mapping[str, Any], folder: Path) -> Result:
+    """Collect what lies in a result's folder: its files, its log, its 3-D still."""
+    folder = Path(folder)
+    files = sorted(
+        (path.relative_to(folder).as_posix(), path.stat().st_size)
+        for path in folder.rglob("*")
+        if path.is_file() and path.name != PAGE and not path.name.startswith(".")
+    )
+    log, still = folder / "log.txt", folder / "figures" / "scene.png"
+    text = log.read_text(encoding="utf-8", errors="replace") if log.is_file() else ""
+    picture = still.read_bytes() if still.is_file() else b""
+    return Result(registration, kept, files, text, picture)
+
+
+def name_of(entry: Mapping[str, Any]) -> str:
+    """How a survey is called."""
+    return str(entry.get("name") or "a survey")

@@ -1,0 +1,277 @@
+"""What the page says in sentences: what to do next, and how it was done, ready to paste."""
+
+from __future__ import annotations
+
+import math
+import re
+from typing import Any
+
+from meshreg.report import style
+from meshreg.report.markup import number
+from meshreg.types import Registration
+
+PAPER = (
+    "M. Bryson, M. Johnson-Roberson, O. Pizarro and S. B. Williams, Automated registration for "
+    "multi-year robotic surveys of marine benthic habitats, IROS 2013"
+)
+_LOOK = (
+    "Compare both surveys in report.html with swipe and flicker; if they do not lie on each "
+    "other, do not use the registered survey."
+)
+# What the reason says, and what helps. `{wider}` is twice the search radius.
+_ADVICE: tuple[tuple[str, tuple[str, ...]], ...] = (
+    (
+        r"lie .* apart",
+        (
+            "The coordinates of the surveys do not meet: report.html shows where they lie.",
+            "Check the shifts (--reference-shift, --moving-shift: east, north, up in metres that "
+            "are added to a file's coordinates) and the coordinate system of each file.",
+            "If the distance is real, search further: --search-radius with more metres than that.",
+        ),
+    ),
+    (
+        r"when (turned|mirrored|with east)",
+        (
+            "One of the files has its axes exchanged or mirrored. Check --axes (enu or ned) and "
+            "--up (y or z), or write them into a NAME.survey.toml beside the file that differs.",
+            "`meshreg info FILE` says which axes a file seems to have.",
+        ),
+    ),
+    (
+        r"contradict each other",
+        (
+            "Relief and image put the survey at different places; one of them is deceived, for "
+            "example by ripples, by a changed bottom, or by moving plants.",
+            _LOOK,
+            "Mask what moves or what repeats itself (--mask not:FILE), and register again.",
+        ),
+    ),
+    (
+        r"stands out from chance",
+        (
+            "Make sure that both surveys show the same ground: compare them in report.html.",
+            "If their coordinates may be off by more than {radius:g} m, search further "
+            "(--search-radius {wider:g}), or give the shift that is known (--moving-shift).",
+            "Mask what moved or grew (--mask not:FILE). Check units (--unit) and axes (--axes).",
+        ),
+    ),
+    (
+        r"overlap by only",
+        (
+            "So narrow a common strip may fit by luck. " + _LOOK,
+            "A larger survey, or one that lies further over the other, would settle it.",
+        ),
+    ),
+    (
+        r"search border|outside the search radius",
+        ("The true offset may lie further out: register again with --search-radius {wider:g}.",),
+    ),
+    (
+        r"turned by about",
+        (
+            "The heading of one survey is off by more than this registration corrects. Align the "
+            "model to north again in the software that made it, or check its camera positions.",
+        ),
+    ),
+    (
+        r"too (small|large)",
+        (
+            "The lengths of the surveys differ. Check the scale bars or camera positions of the "
+            "model that is wrong, and make it again; growth does not stretch the ground.",
+        ),
+    ),
+    (
+        r"tilted against",
+        (
+            "One model leans by more than this registration corrects. Align it to the vertical in "
+            "the software that made it (camera positions, depth, level markers), or check --up.",
+        ),
+    ),
+    (
+        r"tiles alone lie",
+        (
+            "Pieces of the survey ask for another offset than the whole: the model may be bent, "
+            "scaled, or its ground may have moved. Look at the residual field in report.html.",
+            _LOOK,
+        ),
+    ),
+    (
+        r"chance could do as well|stands out, and not overwhelmingly",
+        (
+            _LOOK,
+            "More common ground, finer textures, or a mask over what changed (--mask not:FILE) "
+            "give the answer more weight; so does a smaller --search-radius where the offset is "
+            "known to be small.",
+        ),
+    ),
+    (
+        r"do not overlap|no method found",
+        (
+            "There is too little in common to compare. Check that both files are whole, and their "
+            "shifts, axes and units (`meshreg info FILE`).",
+        ),
+    ),
+)
+_FALLBACK = {
+    "review": (
+        _LOOK,
+        "More overlap, a mask over what moves (--mask not:FILE), or a known shift "
+        "(--moving-shift) may settle it.",
+    ),
+    "rejected": (
+        "Check that both surveys show the same ground, their shifts (--reference-shift, "
+        "--moving-shift), axes (--axes, --up) and units (--unit); a larger --search-radius costs "
+        "only time.",
+    ),
+}
+
+
+def next_steps(registration: Registration) -> tuple[str, ...]:
+    """Sentences that say what to do about a verdict that is not "accepted"."""
+    if registration.verdict == "accepted":
+        return ()
+    radius = _of(registration.settings, "search", "radius") or 10.0
+    steps = [
+        step.format(radius=radius, wider=2 * radius)
+        for pattern, found in _ADVICE
+        if re.search(pattern, registration.reason)
+        for step in found
+    ]
+    return tuple(dict.fromkeys(steps or _FALLBACK[registration.verdict]))
+
+
+def _of(settings: Any, *keys: str) -> Any:
+    for name in keys:
+        settings = settings.get(name) if hasattr(settings, "get") else None
+    return settings
+
+
+def methods_paragraph(registration: Registration) -> str:
+    """Return how it was done, in prose for a paper: parameters, versions, checksums."""
+    r, settings = registration, registration.settings
+    versions = dict(r.versions)
+    meshreg = versions.pop("meshreg", "")
+    versions.pop("platform", None)
+    raster = settings.get("raster", {})
+    names = [style.method_name(name) for name in settings.get("methods", ())]
+    cells = [
+        f"{what} cells of {raster[name]:g} m"
+        for what, name in (("elevation", "dem_cell"), ("orthomosaic", "ortho_cell"))
+        if raster.get(name)
+    ]
+    radius = _of(settings, "search", "radius")
+    parts = [
+        f"The survey {_name(r.moving, 'moving')} ({_files(r.moving)}) was registered to the "
+        f"survey {_name(r.reference, 'reference')} ({_files(r.reference)}) with meshreg {meshreg} "
+        f"(preset {settings.get('preset', 'robust')}, seed {settings.get('seed', 0)}), which "
+        f"follows {PAPER}.",
+        f"Both were rasterized from above to {' and '.join(cells)}"
+        f"{_crs(r.reference.get('crs'))}." if cells else "",
+        f"Horizontal offsets within ±{radius:g} m were searched by {_listed(names)}; the proposals "
+        "were weighed against relief and image of the whole overlap, and the best was refined on "
+        "tiles." if radius and names else "",
+        _outcome(r),
+        _agreement(r),
+        "Software: "
+        + ", ".join(
+            f"{name.capitalize() if name == 'python' else name} {version}"
+            for name, version in versions.items()
+        )
+        + ".",
+    ]  # fmt: skip
+    return " ".join(part for part in parts if part)
+
+
+def _name(entry: Any, default: str) -> str:
+    return str(entry.get("name") or default)
+
+
+def _files(entry: Any) -> str:
+    """Return the files' names and checksums; a long list is cut."""
+    paths, sums = entry.get("path") or [], entry.get("sha256") or []
+    pairs = [
+        f"{path}, SHA-256 {digest}" if digest else str(path)
+        for path, digest in zip(paths, [*sums, *[""] * len(paths)], strict=False)
+    ]
+    if len(pairs) > 3:
+        pairs = [*pairs[:3], f"and {len(pairs) - 3} more files"]
+    return "; ".join(pairs) or "made in memory"
+
+
+def _crs(crs: Any) -> str:
+    return f" in {crs}" if crs else " in a local frame"
+
+
+def _listed(names: list[str]) -> str:
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
+
+
+def sigmas(registration: Registration) -> tuple[float, float, float, float]:
+    """One sigma of east, north, up [m] and yaw [degrees]; NaN where there is none."""
+    covariance = registration.covariance
+    if covariance is None:
+        return (math.nan,) * 4
+    east, north, up, yaw = (math.sqrt(max(float(covariance[k, k]), 0.0)) for k in (0, 1, 2, 5))
+    return east, north, up, math.degrees(yaw)
+
+
+def yaw_degrees(registration: Registration) -> float:
+    """Rotation about the vertical, counted from east to north."""
+    transform = registration.transform
+    if transform is None:
+        return math.nan
+    return math.degrees(math.atan2(transform.rotation[1, 0], transform.rotation[0, 0]))
+
+
+def tilt_degrees(registration: Registration) -> float:
+    """Angle between the vertical before and after; zero where no tilt was estimated."""
+    transform = registration.transform
+    if transform is None:
+        return math.nan
+    return math.degrees(math.hypot(*transform.rotation[:2, 2]))  # its sine, for so small an angle
+
+
+def _outcome(r: Registration) -> str:
+    if r.transform is None:
+        return f"No registration was accepted: {r.reason.strip().rstrip('.')}."
+    moves = [
+        f"{number(value, '+.4f')} ± {number(sigma, '.4f')} m {name}"
+        for name, value, sigma in zip(
+            ("east", "north", "up"), r.transform.offset.tolist(), sigmas(r)[:3], strict=True
+        )
+    ]
+    tilt = tilt_degrees(r)
+    tilted = f", tilts it by {tilt:.4f}°" if tilt > 0 else ""
+    word = {"accepted": "accepted", "review": "held for review, not accepted"}[r.verdict]
+    return (
+        f"The registration was {word}: {r.reason.strip().rstrip('.')}. It moves the survey by "
+        f"{_listed(moves)}{tilted} and turns it by {number(yaw_degrees(r), '+.4f')} ± "
+        f"{number(sigmas(r)[3], '.4f')}° about the centre of its bounding box (one sigma)."
+    )
+
+
+def _agreement(r: Registration) -> str:
+    parts = [_compared(r)]
+    error = r.registration_error
+    if error:
+        parts.append(
+            "The registration error at the overlap's centroid is "
+            f"{error['x']:.4f}, {error['y']:.4f} and {error['z']:.4f} m (east, north, up; one "
+            f"sigma), at most {error['isotropic']:.4f} m in any direction."
+        )
+    if r.internal and r.internal.get("said"):
+        said = str(r.internal["said"]).strip().rstrip(".")
+        parts.append(f"Internal error: {said}.")
+    return " ".join(part for part in parts if part)
+
+
+def _compared(r: Registration) -> str:
+    overlap, after = r.after.get("overlap"), r.after.get("height_nmad")
+    if overlap is None or after is None or not math.isfinite(after):
+        return ""
+    before = r.before.get("height_nmad")
+    earlier = f" ({before:.3f} m before)" if before is not None and math.isfinite(before) else ""
+    return (
+        f"After registration {overlap:.0%} of the smaller survey overlap, and the NMAD of the "
+        f"height differences there is {after:.3f} m{earlier}."
+    )

@@ -1,0 +1,211 @@
+"""The last millimetres on the 3-D surfaces themselves: generalized ICP from the pose found.
+
+A DEM sees a reef from above; its overhangs and walls, where much of the coral is, are seen only
+here. Opt-in (`refine.surfaces = "gicp"`), since it needs Open3D, and believed only where it is a
+small step that makes the surfaces agree better.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from meshreg.errors import UsageError
+from meshreg.types import Float64, Maps, Mesh, Survey, Transform
+
+GATE = 0.03  # m: points further apart have changed, or are not the same surface
+MAX_POINTS = 1_000_000
+SURFACES = ("none", "gicp")
+
+
+@dataclass(frozen=True, eq=False)
+class Polished:
+    """What generalized ICP says.
+
+    Attributes
+    ----------
+    transform : Transform
+        `reference_from_moving`: the polished one where it was accepted, else the one given.
+    accepted : bool
+    moved : float
+        How far the overlap's centroid went [m].
+    before, after : float
+        Root mean square distance of the moving points from the reference's tangent planes [m], of
+        pairs within the gate.
+    note : str
+        What the user should know.
+    """
+
+    transform: Transform
+    accepted: bool
+    moved: float
+    before: float
+    after: float
+    note: str
+
+
+def check_surfaces(kind: str) -> None:
+    """Raise UsageError for an unknown `refine.surfaces`."""
+    if kind not in SURFACES:
+        raise UsageError(
+            f"refine.surfaces is {kind!r}.", remedy=f"Use one of {', '.join(SURFACES)}."
+        )
+
+
+def polish(
+    reference: Survey,
+    moving: Survey,
+    transform: Transform,
+    place: Float64,
+    error: Mapping[str, Any] | None,
+    seed: int = 0,
+    max_points: int = MAX_POINTS,
+) -> Polished:
+    """Polish a registration by generalized ICP (Segal, Haehnel and Thrun 2009) on both surfaces.
+
+    Points of both surveys (sampled over a mesh's area) are paired within 3 cm, with Tukey's
+    robust kernel over the same width, in an origin of their own.
+
+    Parameters
+    ----------
+    reference, moving : Survey
+        Meshes or point clouds; maps have no 3-D surface.
+    transform : Transform
+        The pose found, `reference_from_moving`.
+    place : (3,) float64
+        Centroid of the overlap, absolute in the moving survey [m].
+    error : mapping or None
+        Standard deviations x, y, z there [m] (`Registration.registration_error`).
+    seed : int
+        Of the points' draw.
+    max_points : int
+        Of each survey.
+
+    Returns
+    -------
+    Polished
+        Accepted only if the centroid moves, along each axis, by at most three sigmas or 3 cm, and
+        the points within the gate lie closer than before.
+
+    Raises
+    ------
+    UsageError
+        If Open3D cannot be imported.
+    """
+    if isinstance(reference.geometry, Maps) or isinstance(moving.geometry, Maps):
+        return _kept(transform, "maps have no 3-D surface to polish on")
+    o3d = _open3d()
+    home = transform.apply(place)
+    rng = np.random.default_rng(seed)
+    fixed = sampled(reference, max_points, rng) - home
+    loose = transform.apply(sampled(moving, max_points, rng)) - home
+    fixed, loose = _shared(fixed, loose)
+    if min(len(fixed), len(loose)) < 1000:
+        return _kept(transform, "too few points in common to polish on")
+    clouds = [o3d.geometry.PointCloud(o3d.utility.Vector3dVector(p)) for p in (loose, fixed)]
+    for cloud in clouds:
+        cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(20))
+    pipeline = o3d.pipelines.registration
+    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+        start = pipeline.evaluate_registration(*clouds, GATE, np.eye(4))
+        if start.fitness < 0.1:
+            return _kept(transform, "the surfaces lie too far apart to polish on")
+        kernel = pipeline.TukeyLoss(k=GATE)
+        found = pipeline.registration_generalized_icp(
+            *clouds,
+            GATE,
+            np.eye(4),
+            pipeline.TransformationEstimationForGeneralizedICP(kernel),
+            pipeline.ICPConvergenceCriteria(1e-9, 1e-9, 60),
+        )
+    step = _proper(np.asarray(found.transformation))
+    moved = np.abs(step.offset)
+    before, after = (
+        _distance(fixed, clouds[1], step_.apply(loose)) for step_ in (Transform(), step)
+    )
+    sigma = np.array([error[axis] for axis in "xyz"]) if error else np.zeros(3)
+    small = bool((moved <= np.maximum(3 * sigma, GATE)).all())
+    better = after < before and found.fitness >= 0.98 * start.fitness
+    length = float(np.linalg.norm(step.offset))
+    if not (small and better):
+        why = "it does not bring them closer" if small else f"it would move it by {length:.3f} m"
+        return Polished(
+            transform, False, length, before, after, f"polishing on the surfaces is left out: {why}"
+        )
+    step = Transform(step.rotation, 1.0, step.offset, home)
+    note = (
+        f"polished on the surfaces: moved by {1000 * length:.1f} mm, "
+        f"distance {1000 * before:.1f} mm to {1000 * after:.1f} mm rms"
+    )
+    whole = (step @ transform).at(transform.pivot)
+    return Polished(whole, True, length, before, after, note)
+
+
+def sampled(survey: Survey, count: int, rng: np.random.Generator) -> Float64:
+    """Absolute points (N, 3) on a survey: a cloud's own, or uniform over a mesh's area."""
+    geometry = survey.geometry
+    assert not isinstance(geometry, Maps)
+    if not isinstance(geometry, Mesh) or not len(geometry.faces):
+        points = geometry.points
+        if len(points) > count:
+            points = points[rng.choice(len(points), count, replace=False)]
+        return np.asarray(points + survey.origin)
+    corners = geometry.vertices[geometry.faces]
+    area = np.linalg.norm(
+        np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
+    )
+    total = np.cumsum(area)
+    number = min(count, 2 * len(geometry.faces))
+    face = np.searchsorted(total, rng.random(number) * total[-1])
+    u, v = rng.random((2, number))
+    over = u + v > 1  # fold the square into the triangle
+    u, v = np.where(over, 1 - u, u)[:, None], np.where(over, 1 - v, v)[:, None]
+    a, b, c = (corners[np.minimum(face, len(area) - 1), k] for k in range(3))
+    return np.asarray(a + u * (b - a) + v * (c - a) + survey.origin)
+
+
+def _shared(fixed: Float64, loose: Float64) -> tuple[Float64, Float64]:
+    """Return the points of each within the other's bounding box and the gate."""
+    kept = []
+    for own, other in ((fixed, loose), (loose, fixed)):
+        if not len(other):
+            return fixed[:0], loose[:0]
+        low, high = other.min(axis=0) - GATE, other.max(axis=0) + GATE
+        kept.append(own[((own >= low) & (own <= high)).all(axis=1)])
+    return kept[0], kept[1]
+
+
+def _distance(fixed: Float64, cloud: Any, loose: Float64) -> float:
+    from scipy.spatial import cKDTree
+
+    loose = loose[:: max(1, len(loose) // 100_000)]
+    far, which = cKDTree(fixed).query(loose, distance_upper_bound=GATE)
+    near = np.isfinite(far)
+    normals = np.asarray(cloud.normals)[which[near]]
+    along = ((loose[near] - fixed[which[near]]) * normals).sum(axis=1)
+    return float(np.sqrt(np.mean(along**2))) if near.any() else float("nan")
+
+
+def _proper(matrix: Float64) -> Transform:
+    """Return a rigid matrix about the local origin, its rotation orthogonal to the last bit."""
+    u, _, vt = np.linalg.svd(matrix[:3, :3])
+    return Transform(u @ vt, 1.0, matrix[:3, 3])
+
+
+def _kept(transform: Transform, why: str) -> Polished:
+    nan = float("nan")
+    return Polished(transform, False, 0.0, nan, nan, why)
+
+
+def _open3d() -> Any:
+    try:
+        import open3d
+    except (ImportError, OSError) as error:
+        raise UsageError(
+            f"refine.surfaces is 'gicp', but Open3D cannot be imported: {error}.",
+            remedy="Run `meshreg doctor` to see what is missing, or leave it at 'none'.",
+        ) from error
+    return open3d

@@ -1,0 +1,218 @@
+"""Height and tilt against planes, growth and bending that are known exactly."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import numpy as np
+import pytest
+import seafloor
+from hypothesis import given
+from hypothesis import strategies as st
+from made_registration import made_registration
+
+from meshreg import statistics
+from meshreg.errors import UsageError
+from meshreg.heights import MAX_TILT, fit_heights, rotation
+from meshreg.types import Transform
+
+HERE = Transform()
+
+
+@functools.cache
+def relief(seed=3, half=7.0, noise=0.002, noise_seed=0):
+    floor = seafloor.Seafloor.random(seed, size=2 * half + 6)
+    return floor.raster(0.1, half, noise=noise, seed=noise_seed)
+
+
+def places(raster):
+    row, col = np.indices(raster.grid.shape)
+    return raster.grid.east_north(row, col)
+
+
+def lowered(raster, by, valid=None):
+    """The raster with `by` taken from its heights, so that `by` is to be added again."""
+    height = raster.height.astype(float) - by
+    if valid is None:
+        return dataclasses.replace(raster, height=height)
+    return dataclasses.replace(raster, height=np.where(valid, height, np.nan), valid=valid)
+
+
+def plane(raster, up, tilt_east, tilt_north):
+    east, north = places(raster)
+    return up + tilt_east * (north - north.mean()) - tilt_north * (east - east.mean())
+
+
+def patches(raster, share, seed, width=0.5):
+    """Round patches over about `share` of the cells: colonies, nowhere a whole block wide."""
+    rng = np.random.default_rng(seed)
+    east, north = places(raster)
+    grown = np.zeros(raster.grid.shape, bool)
+    while grown.mean() < share:
+        e, n = rng.uniform(east.min(), east.max()), rng.uniform(north.min(), north.max())
+        grown |= np.hypot(east - e, north - n) < width * rng.uniform(0.5, 1.0)
+    return grown
+
+
+def test_a_raster_onto_itself_stays():
+    found = fit_heights(relief(), relief(), HERE)
+    assert abs(found.up) < 1e-9
+    assert not found.tilt.any()
+    assert found.kept > 0.99
+    assert np.abs(found.covariance).max() < 1e-16
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize("degrees", [0.1, 1.0])
+def test_known_plane_is_recovered(degrees, sign):
+    tilt = sign * np.deg2rad(degrees) * np.array([0.8, -0.6])
+    other = relief(noise_seed=1)
+    found = fit_heights(relief(), lowered(other, plane(other, sign * 0.37, *tilt)), HERE)
+    # a tilt also moves relief sideways, which adding a plane does not
+    np.testing.assert_allclose(
+        np.rad2deg(found.tilt), np.rad2deg(tilt), atol=0.005 + 0.01 * degrees
+    )
+    assert found.up == pytest.approx(sign * 0.37, abs=0.001 + 0.001 * degrees)
+    assert not found.doubt
+
+
+def test_a_plane_within_the_noise_is_left_alone():
+    other = relief(noise_seed=1)
+    found = fit_heights(relief(), lowered(other, plane(other, 0.02, 2e-6, 1e-6)), HERE)
+    assert not found.tilt.any()
+    assert found.up == pytest.approx(0.02, abs=3e-4)
+
+
+def test_a_tilt_beyond_three_degrees_is_doubted_and_not_applied():
+    other = relief(noise_seed=1)
+    found = fit_heights(relief(), lowered(other, plane(other, 0.0, np.deg2rad(5.0), 0.0)), HERE)
+    assert "beyond 3°" in found.doubt
+    assert not found.tilt.any()
+
+
+@pytest.mark.parametrize("height", [0.08, -0.08])
+def test_growth_on_one_side_does_not_pull(height):
+    """A third of the ground, most of it in the west, grew (or broke off) by 8 cm."""
+    other = relief(noise_seed=1)
+    east, _ = places(other)
+    grown = patches(other, 0.45, 7) & (east < east.mean() + 3)
+    assert 0.2 < grown.mean() < 0.4
+    found = fit_heights(relief(), lowered(other, np.where(grown, -height, 0.0)), HERE)
+    assert abs(found.up) < 0.003  # the mean would say 24 mm
+    assert np.abs(np.rad2deg(found.tilt)).max() < 0.03
+    assert 1 - found.kept == pytest.approx(grown.mean(), abs=0.15)
+
+
+def test_slow_bending_is_averaged_over_all_ground():
+    """The answer is the uniform least-squares fit, not the fit to where the models agree."""
+    other = relief(noise_seed=1)
+    east, north = places(other)
+    x, y = east / np.abs(east).max(), north / np.abs(north).max()
+    bowl = 0.06 * (x**2 + y**2) + 0.03 * x**3 - 0.04 * x * y
+    design = np.stack([np.ones(x.size), north.ravel(), -east.ravel()], axis=1)
+    best = np.linalg.lstsq(design, bowl.ravel(), rcond=None)[0]
+    found = fit_heights(relief(), lowered(other, bowl), HERE)
+    assert found.up == pytest.approx(best[0], abs=0.0015)
+    np.testing.assert_allclose(np.rad2deg(found.tilt), np.rad2deg(best[1:]), atol=0.02)
+
+
+def test_what_lies_under_the_mask_changes_nothing():
+    valid = np.ones(relief().grid.shape, bool)
+    valid[:40, 60:] = False
+    first, second = (
+        fit_heights(relief(), lowered(relief(noise_seed=1), 0.02 + wild * ~valid, valid), HERE)
+        for wild in (0.0, 7.0)
+    )
+    assert first.up == second.up
+    np.testing.assert_array_equal(first.covariance, second.covariance)
+    assert first.up == pytest.approx(0.02, abs=5e-4)
+
+
+def test_nothing_in_common_is_said():
+    found = fit_heights(relief(), relief(), Transform(offset=(100.0, 0.0, 0.0)))
+    assert "no heights in common" in found.note
+    assert found.up == 0.0
+    assert not found.covariance.any()
+
+
+def test_too_little_for_blocks_takes_the_median():
+    small = relief(half=1.0)
+    found = fit_heights(small, lowered(small, 0.05), HERE)
+    assert found.up == pytest.approx(0.05, abs=1e-6)
+    assert "too little" in found.note
+    assert found.covariance[1, 1] > 0
+
+
+def test_covariance_is_the_scatter():
+    """Ground that errs in patches half a metre wide: answers scatter by the stated sigma."""
+    from scipy.ndimage import gaussian_filter
+
+    still = dataclasses.replace(relief(half=6.0), height=np.zeros(relief(half=6.0).grid.shape))
+    answers, stated = [], []
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        error = gaussian_filter(rng.normal(0, 0.05, still.grid.shape), 3.0)
+        found = fit_heights(still, lowered(still, error), HERE)
+        answers.append(found.up)
+        stated.append(found.covariance[0, 0])
+    ratio = np.mean(stated) / np.mean(np.square(answers))
+    assert 0.5 < ratio < 2.5
+
+
+@given(
+    st.floats(-MAX_TILT, MAX_TILT),
+    st.floats(-MAX_TILT, MAX_TILT),
+    st.floats(-3.0, 3.0),
+)
+def test_completed_transform_lifts_its_place_and_turns_right_handedly(a, b, yaw):
+    c, s = np.cos(yaw), np.sin(yaw)
+    flat = Transform([[c, -s, 0], [s, c, 0], [0, 0, 1]], 1.0, (5.0, -3.0, 0.0), (1e5, 2e6, 0.0))
+    place = np.array([1e5 + 10, 2e6 - 4, -12.0])
+    found = dataclasses.replace(
+        fit_heights(relief(), relief(), Transform(offset=(100.0, 0.0, 0.0))),
+        place=place,
+        up=0.25,
+        tilt=np.array([a, b]),
+    )
+    whole = found.transform(flat)
+    lift = whole.apply(place) - flat.apply(place)
+    np.testing.assert_allclose(lift, [0, 0, 0.25], atol=1e-8)
+    turn = rotation(np.array([a, b]))
+    np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-12)
+    # to the first order: east turns down about north, north turns up about east
+    np.testing.assert_allclose(turn[2, :2], [-b, a], atol=2e-4)
+    np.testing.assert_allclose(whole.rotation, turn @ flat.rotation, atol=1e-12)
+
+
+def test_registration_sigma_is_what_drawn_transforms_scatter_by():
+    registration = made_registration()
+    rng = np.random.default_rng(0)
+    root = rng.normal(size=(7, 7)) * np.array([3e-3, 2e-3, 4e-3, 1e-4, 2e-4, 3e-4, 1e-4])[:, None]
+    registration = dataclasses.replace(registration, covariance=root @ root.T)
+    transform = registration.transform
+    home = transform.pivot + transform.offset
+    place = home + np.array([7.0, -11.0, 2.0])
+    scatter = []
+    for t_e, t_n, t_u, a, b, yaw, scale in rng.multivariate_normal(
+        np.zeros(7), registration.covariance, 20_000
+    ):
+        turn = np.array([[0, -yaw, b], [yaw, 0, -a], [-b, a, 0]])  # infinitesimal, right-handed
+        arm = place - home
+        scatter.append(np.array([t_e, t_n, t_u]) + turn @ arm + scale * arm)
+    found = statistics.registration_sigma(registration, *place)
+    np.testing.assert_allclose(found, np.std(scatter, axis=0), rtol=0.03)
+    many = statistics.registration_sigma(
+        registration, np.full((2, 3), place[0]), np.full((2, 3), place[1]), place[2]
+    )
+    np.testing.assert_allclose(many, np.broadcast_to(found, (2, 3, 3)))
+    # one number for all directions is never too small in any
+    stated = statistics.registration_error(registration.covariance, transform, place)
+    np.testing.assert_allclose([stated[axis] for axis in "xyz"], found)
+    assert stated["isotropic"] >= found.max()
+    assert stated["isotropic"] <= np.sqrt((found**2).sum())
+
+
+def test_a_rejected_registration_states_no_sigma():
+    with pytest.raises(UsageError, match="rejected"):
+        statistics.registration_sigma(made_registration("rejected"), 0.0, 0.0)

@@ -1,0 +1,146 @@
+"""Generalized ICP on a seafloor with overhangs, moved by what is known exactly."""
+
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+import pytest
+import seafloor
+
+from meshreg import Maps, Mesh, PointCloud, Survey, apply_transform
+from meshreg.errors import UsageError
+from meshreg.surfaces import check_surfaces, polish, sampled
+from meshreg.types import Grid, Transform
+
+SIGMA = {"x": 0.004, "y": 0.004, "z": 0.004}
+
+
+def ball(centre, radius, n=24):
+    """Return vertices and faces of a sphere; its lower half no DEM can see."""
+    polar, around = np.linspace(0, np.pi, n), np.linspace(0, 2 * np.pi, 2 * n, endpoint=False)
+    p, a = (m.ravel() for m in np.meshgrid(polar, around, indexing="ij"))
+    unit = np.stack([np.sin(p) * np.cos(a), np.sin(p) * np.sin(a), np.cos(p)], axis=1)
+    row, col = (m.ravel() for m in np.meshgrid(np.arange(n - 1), np.arange(2 * n), indexing="ij"))
+    one, two = row * 2 * n + col, row * 2 * n + (col + 1) % (2 * n)
+    faces = np.concatenate(
+        [np.stack([one, one + 2 * n, two], 1), np.stack([two, one + 2 * n, two + 2 * n], 1)]
+    )
+    return centre + radius * unit, faces
+
+
+def reef(seed=0, half=1.2, step=0.04, place=0, kind="mesh"):
+    """Floor of bumps with balls that float over it; `seed` is of the noise, `place` of the reef."""
+    floor = seafloor.Seafloor.random(100 + place, size=2 * half + 4).raster(step, half, noise=0.0)
+    n = floor.grid.shape[0]
+    row, col = np.mgrid[0:n, 0:n]
+    east, north = floor.grid.east_north(row, col)
+    vertices = [np.stack([east, north, floor.height.astype(float)], axis=-1).reshape(-1, 3)]
+    index = np.arange(n * n).reshape(n, n)
+    a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]
+    faces = [np.stack([a, c, b], -1).reshape(-1, 3), np.stack([b, c, d], -1).reshape(-1, 3)]
+    rng = np.random.default_rng(place)
+    for _ in range(8):
+        centre = np.append(rng.uniform(-0.8 * half, 0.8 * half, 2), rng.uniform(0.3, 0.6))
+        points, triangles = ball(centre, rng.uniform(0.12, 0.3))
+        faces.append(triangles + sum(len(v) for v in vertices))
+        vertices.append(points)
+    noise = np.random.default_rng(seed)
+    points = np.concatenate(vertices)
+    points = points + noise.normal(0, 0.001, points.shape)
+    mesh = Mesh(points, np.concatenate(faces))
+    if kind == "cloud":
+        drawn = sampled(Survey("drawn", mesh), 25_000, noise)
+        return Survey("reef", PointCloud(drawn))
+    return Survey("reef", mesh)
+
+
+def small_motion():
+    """A registration that is off by a centimetre, a tenth of a degree of yaw and of tilt."""
+    t = np.deg2rad(0.1)
+    yaw = np.array([[np.cos(t), -np.sin(t), 0], [np.sin(t), np.cos(t), 0], [0, 0, 1]])
+    tilt = np.array([[1, 0, 0], [0, np.cos(t), -np.sin(t)], [0, np.sin(t), np.cos(t)]])
+    return Transform(yaw @ tilt, 1.0, (0.007, -0.005, 0.006))
+
+
+@pytest.mark.needs("open3d")
+@pytest.mark.parametrize("kind", ["mesh", "cloud"])
+def test_a_small_motion_is_taken_back(kind):
+    truth = small_motion()
+    far = Transform(offset=(731_000.0, 5_705_000.0, -12.0))  # at UTM size, where float32 is blind
+    reference = apply_transform(reef(seed=1, kind=kind), far)
+    moving = apply_transform(reef(seed=2, kind=kind), far @ truth.inverse())
+    found = polish(reference, moving, Transform(), far.offset, SIGMA, max_points=25_000)
+    assert found.accepted, found.note
+    assert found.after < found.before
+    assert found.moved == pytest.approx(np.linalg.norm(truth.offset), abs=0.002)
+    corners = far.offset + np.array([[x, y, 0.3] for x in (-1, 1) for y in (-1, 1)])
+    want = far.apply(truth.apply(corners - far.offset))
+    error = np.linalg.norm(found.transform.apply(corners) - want, axis=1)
+    assert error.max() < 0.002
+    assert np.linalg.norm(corners - want, axis=1).max() > 0.009
+
+
+@pytest.mark.needs("open3d")
+def test_surfaces_that_lie_right_already_stay():
+    found = polish(reef(1), reef(2), Transform(), np.zeros(3), SIGMA, max_points=25_000)
+    assert np.linalg.norm(found.transform.apply(np.zeros(3))) < 0.001
+
+
+@pytest.mark.needs("open3d")
+def test_another_reef_is_left_alone():
+    start = Transform(offset=(0.01, 0.02, 0.0))
+    found = polish(reef(place=0), reef(place=7), start, np.zeros(3), SIGMA, max_points=25_000)
+    assert not found.accepted
+    assert found.transform is start
+    assert found.note
+
+
+@pytest.mark.needs("open3d")
+def test_surveys_without_points_in_common_are_left_alone():
+    start = Transform(offset=(50.0, 0.0, 0.0))
+    found = polish(reef(), reef(seed=1), start, np.zeros(3), SIGMA)
+    assert found.transform is start
+    assert "too few points" in found.note
+
+
+def test_maps_have_no_surface():
+    height = np.zeros((4, 4), np.float32)
+    maps = Survey("maps", Maps(height, Grid(0.0, 4.0, 1.0, (4, 4))))
+    found = polish(maps, maps, Transform(), np.zeros(3), SIGMA)
+    assert not found.accepted
+    assert "maps" in found.note
+
+
+def test_without_open3d_the_remedy_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "open3d", None)
+    cloud = Survey("cloud", PointCloud(np.random.default_rng(0).random((10, 3))))
+    with pytest.raises(UsageError, match="meshreg doctor"):
+        polish(cloud, cloud, Transform(), np.zeros(3), SIGMA)
+
+
+def test_unknown_surfaces_are_a_misuse():
+    check_surfaces("none")
+    with pytest.raises(UsageError, match="'icp'"):
+        check_surfaces("icp")
+
+
+def test_points_are_uniform_over_the_area():
+    """Two squares, one of four times the area, in triangles of very different number."""
+    big = np.array([[0, 0, 0], [2, 0, 0], [2, 2, 0], [0, 2, 0]], float)
+    n = 20
+    row, col = np.mgrid[0:n, 0:n]
+    grid = np.stack([5 + col / (n - 1), row / (n - 1), 0 * row], -1).reshape(-1, 3)
+    index = 4 + np.arange(n * n).reshape(n, n)
+    a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]
+    faces = np.concatenate(
+        [[[0, 1, 2], [0, 2, 3]]] + [np.stack(t, -1).reshape(-1, 3) for t in ((a, b, c), (b, d, c))]
+    )
+    survey = Survey(
+        "squares", Mesh(np.concatenate([big, grid]), faces), origin=np.array([9, 9, 9.0])
+    )
+    points = sampled(survey, 1000, np.random.default_rng(0)) - 9
+    in_big = points[:, 0] <= 2
+    assert in_big.mean() == pytest.approx(0.8, abs=0.05)
+    assert points[in_big, :2].mean(axis=0) == pytest.approx([1, 1], abs=0.1)
+    assert np.abs(points[:, 2]).max() < 1e-9
