@@ -111,4 +111,5 @@ def as_delivered(refined: Refined, motion: Transform) -> Refined:
         offset=refined.pivot + refined.offset - pivot,
         yaw=refined.yaw + float(np.arctan2(motion.rotation[1, 0], motion.rotation[0, 0])),
         tiles=tiles,
+        field=None,
     )

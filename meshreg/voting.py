@@ -29,9 +29,7 @@ MIN_TILES = 4
 STANDS_OUT = 3.0  # deviations over the best unrelated hypothesis; chance reaches 2
 SMALL_YAW = np.deg2rad(0.9)  # `refine` turns up to 1° by itself; the rest is the vote's own error
 PLAIN_SCALE = 0.01  # a scale nearer to 1 than this is not plainly wrong,
-PLAIN_RATIO = math.sqrt(3)  # nor one that explains under three quarters of what moves the tiles;
-FINE_SCALE = 0.002  # smaller ones are left to the finest tiles, where a scale is asked for
-WILD_SCALE = 0.025  # but this is more than any internal distortion makes
+PLAIN_RATIO = 2.0  # nor one that explains under four fifths of what moves the tiles
 CLEAR = 3.0  # deviations: a lower peak of a single tile is not used for the fit
 
 
@@ -119,7 +117,7 @@ def vote(pairs: Mapping[str, Pair], settings: SearchSettings, radius: float) -> 
     if best is None or best.gap < STANDS_OUT:
         return None
     off = abs(best.stretch - 1)
-    plain = (off >= PLAIN_SCALE and best.ratio >= PLAIN_RATIO) or off >= WILD_SCALE
+    plain = off >= PLAIN_SCALE and best.ratio >= PLAIN_RATIO
     if max_scale > 0 and (plain or (settings.free_scale and off >= FINE_SCALE)):
         best = replace(best, scale=best.stretch)
     inside = abs(best.yaw) <= max_yaw + SMALL_YAW and off <= max_scale + PLAIN_SCALE

@@ -170,7 +170,11 @@ def _color_of(mesh, images, hit, wrap):
 
 
 def cloud_raster(survey, grid, layer):
-    """Mean height and color of the points within `layer` of each cell's highest; their number."""
+    """Mean height and color of the points within `layer` of each cell's highest; their number.
+
+    The height is carried from the mean place of the points to the cell's centre along the slope
+    between its neighbours, four times over.
+    """
     cloud: PointCloud = survey.geometry
     members: dict[tuple[int, int], list[int]] = {}
     for index, point in enumerate(cloud.points + survey.origin):
@@ -178,16 +182,34 @@ def cloud_raster(survey, grid, layer):
         col = math.floor((point[0] - grid.west) / grid.cell)
         if 0 <= row < grid.shape[0] and 0 <= col < grid.shape[1]:
             members.setdefault((row, col), []).append(index)
-    height = np.full(grid.shape, np.nan)
+    mean = np.full((*grid.shape, 3), np.nan)  # east and south of the centre in cells, height
     count = np.zeros(grid.shape, int)
     color = np.zeros((*grid.shape, 3))
     for (row, col), indices in members.items():
         z = cloud.points[indices, 2] + survey.origin[2]
         top = z >= z.max() - layer
-        height[row, col] = z[top].mean()
+        east, north = (cloud.points[indices, :2] + survey.origin[:2])[top].mean(axis=0)
+        mean[row, col] = (
+            (east - grid.west) / grid.cell - col - 0.5,
+            (grid.north - north) / grid.cell - row - 0.5,
+            z[top].mean(),
+        )
         count[row, col] = top.sum()
         if cloud.colors is not None:
             color[row, col] = cloud.colors[indices][top].mean(axis=0)
+    height = mean[:, :, 2].copy()
+    for _ in range(4):
+        before = height.copy()
+        for row, col in members:
+            rise = 0.0
+            for axis, (down, right) in enumerate(((0, 1), (1, 0))):
+                ends = [(row + k * down, col + k * right, k) for k in (-1, 0, 1)]
+                ends = [end for end in ends if end[:2] in members]
+                steps = ends[-1][2] - ends[0][2]
+                if steps:
+                    slope = (before[ends[-1][:2]] - before[ends[0][:2]]) / steps
+                    rise += slope * mean[row, col, axis]
+            height[row, col] = mean[row, col, 2] - rise
     return height, count, color
 
 

@@ -23,8 +23,8 @@ from made_registration import OFFSET, made_registration, relief
 from PIL import Image
 
 from meshreg import cli
-from meshreg.cli_parts.reporting import keep_evidence, write_report
-from meshreg.errors import InputError, ResourceLimitError, UsageError
+from meshreg.cli_parts.reporting import add_report, keep_evidence, write_report
+from meshreg.errors import InputError, OutputError, ResourceLimitError, UsageError
 from meshreg.io.evidence import NAME, read_evidence, write_evidence
 from meshreg.io.record import read_registration, write_registration
 from meshreg.report import charts, frame, keep, keeping, pictures, view, words
@@ -272,6 +272,14 @@ def test_log_and_files_are_shown(tmp_path: Path) -> None:
     assert "registration.json" in links
 
 
+def test_a_validation_beside_the_page_is_named(results: dict[str, Path], tmp_path: Path) -> None:
+    folder = shutil.copytree(results["review"], tmp_path / "r")
+    (folder / "validation.html").write_text("made by `meshreg validate`")
+    write_report(folder)
+    assert "tie points" not in page_of(results["review"]).text
+    assert "Compared with tie points picked by hand" in page_of(folder).text
+
+
 # ---- from the saved record --------------------------------------------------------------------
 
 
@@ -311,6 +319,26 @@ def test_a_pair_too_far_apart_gets_its_page(tmp_path: Path) -> None:
     assert not (tmp_path / "r" / NAME).exists()
     assert "Where the surveys lie" in text
     assert "--reference-shift" in text
+
+
+def test_a_page_that_fails_is_said_and_loses_no_result(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    registration = made_registration("accepted")
+    write_registration(registration, tmp_path / "r")
+    names = {path.name for path in (tmp_path / "r").iterdir()}
+
+    def fail(*_: Any) -> None:
+        raise RuntimeError("no page today")
+
+    monkeypatch.setattr("meshreg.report.keep", fail)
+    add_report(registration, tmp_path / "r")
+    assert "report.html was not made: RuntimeError: no page today" in caplog.messages
+    assert {path.name for path in (tmp_path / "r").iterdir()} == names
+    monkeypatch.undo()
+    (tmp_path / "r" / "report.html").mkdir()  # no room for the file
+    with pytest.raises(OutputError):
+        add_report(registration, tmp_path / "r")
 
 
 def _truncated(path: Path) -> None:

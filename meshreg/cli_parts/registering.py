@@ -20,7 +20,7 @@ from meshreg.cli_parts.common import (
 )
 from meshreg.cli_parts.console import Progress, Voice, logging_to
 from meshreg.cli_parts.guard import Unfinished
-from meshreg.cli_parts.reporting import keep_evidence, write_report
+from meshreg.cli_parts.reporting import add_report
 from meshreg.cli_parts.validating import read_manual
 from meshreg.settings import Settings
 
@@ -111,8 +111,7 @@ def register_into(folder: Path, request: RegisterRequest, progress: Progress) ->
     write_record_files(registration, folder, reference=reference, moving=moving)
     progress("figures", 0.0)
     draw_figures(registration, folder / "figures")
-    keep_evidence(registration, folder)
-    write_report(folder)
+    add_report(registration, folder)
     progress("figures", 1.0)
     return registration
 

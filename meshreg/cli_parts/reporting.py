@@ -7,11 +7,30 @@ from typing import TYPE_CHECKING, Any
 
 from rich.markup import escape
 
+from meshreg.cli_parts.common import LOG
 from meshreg.cli_parts.console import Voice
-from meshreg.errors import InputError
+from meshreg.errors import InputError, MeshregError
 
 if TYPE_CHECKING:
     from meshreg.types import Registration
+
+
+def add_report(registration: Registration, folder: Path) -> None:
+    """Save the evidence and make the page; one that fails is no reason to lose a result.
+
+    Raises
+    ------
+    OutputError
+        If the files cannot be written.
+    """
+    try:
+        keep_evidence(registration, folder)
+        write_report(folder)
+    except MeshregError:
+        raise
+    except Exception as error:
+        LOG.warning("report.html was not made: %s: %s", type(error).__name__, error)
+        LOG.debug("why", exc_info=True)
 
 
 def keep_evidence(registration: Registration, folder: Path) -> None:

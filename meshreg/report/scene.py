@@ -106,7 +106,7 @@ def _save(picture: Any, path: Path, exaggeration: float = 1.0) -> None:
     canvas = Image.new("RGB", (image.width, image.height + 30), "white")
     canvas.paste(image, (0, 30))
     draw = ImageDraw.Draw(canvas)
-    raised = f", heights × {exaggeration:.1f}" if exaggeration > 1.0 else ""
+    raised = f", heights x {exaggeration:.1f}" if exaggeration > 1.0 else ""
     for column, name in enumerate((f"reference{raised}", f"registered{raised}")):
         draw.text((12 + column * image.width // 2, 8), name, fill="black", font_size=18)
     canvas.save(path, format="PNG")

@@ -17,6 +17,7 @@ FLAGS = [
     "--disable-sync",
     "--no-first-run",
     "--use-angle=swiftshader",  # WebGL without a graphics card
+    "--disable-gpu-compositing",
     "--enable-unsafe-swiftshader",
 ]
 

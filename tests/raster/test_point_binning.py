@@ -60,10 +60,26 @@ def test_what_lies_under_the_top_layer_is_left_out():
     assert absolute(raster)[1, 0] == pytest.approx((4.1 + 5 + 6) / 3, abs=1e-6)
 
 
+def test_points_to_one_side_of_their_cells_do_not_tilt_or_shift_the_surface():
+    """A plane comes out as a plane at the cells' centres, however the points lie in the cells."""
+    rng = np.random.default_rng(3)
+    for place in (
+        rng.uniform(0, 8, (4000, 2)),
+        np.stack(np.meshgrid(*2 * [np.arange(0.01, 8, 0.3)]), -1),
+    ):
+        x, y = place.reshape(-1, 2).T
+        cloud = PointCloud(np.column_stack([x, y, 0.7 * x - 0.4 * y]))
+        raster = rasterize(Survey("c", cloud), Grid(0, 8, 0.4, (20, 20)), PLAIN)
+        east, north = raster.grid.east_north(*np.indices((20, 20)))
+        error = (absolute(raster) - (0.7 * east - 0.4 * north))[raster.valid]
+        assert np.abs(error).max() < 0.01 * 0.4 * 0.7  # a hundredth of what a cell's side rises
+
+
 def test_points_on_the_outer_edge_belong_to_the_last_cells():
-    points = np.array([[0, 0, 1], [2, 2, 2], [0, 2, 3], [2, 0, 4.0]])
+    points = np.array([[0, 0, 4], [2, 2, 4], [0, 2, 4], [2, 0, 4.0]])
     raster = rasterize(Survey("c", PointCloud(points)), Grid(0, 2, 1, (2, 2)), PLAIN)
-    np.testing.assert_allclose(absolute(raster), [[3, 2], [1, 4]], atol=1e-6)
+    np.testing.assert_allclose(absolute(raster), 4.0, atol=1e-6)
+    np.testing.assert_array_equal(raster.samples, 1)
     raster = rasterize(Survey("c", PointCloud(points)), Grid(0, 2, 1, (2, 2)), PLAIN,
                        transform=Transform(offset=np.array([0.001, 0, 0])))  # fmt: skip
     assert raster.valid.sum() == 2
