@@ -30,6 +30,7 @@ STANDS_OUT = 3.0  # deviations over the best unrelated hypothesis; chance reache
 SMALL_YAW = np.deg2rad(0.9)  # `refine` turns up to 1° by itself; the rest is the vote's own error
 PLAIN_SCALE = 0.01  # a scale nearer to 1 than this is not plainly wrong,
 PLAIN_RATIO = 2.0  # nor one that explains under four fifths of what moves the tiles
+FINE_SCALE = 0.002  # smaller ones are left to the finest tiles, where a scale is asked for
 CLEAR = 3.0  # deviations: a lower peak of a single tile is not used for the fit
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -162,7 +162,7 @@ def centred(mean: Float32, lean: Float32, height: Float32, out: Float32) -> None
 
 
 @jit(nogil=True)
-def _rise(height: Float32, lean: Float32, row: int, col: int) -> float:
+def _rise(height: Float32, lean: Float32, row: Any, col: int) -> float:
     """How much higher the surface is at the mean place of a cell's points than at its centre."""
     rows, cols = height.shape
     total = 0.0
