@@ -367,7 +367,7 @@ def _check(reference: Survey, moving: Survey, settings: Settings) -> None:
             raise UsageError(
                 f"Unknown method {method!r}.", remedy=f"There are: {', '.join(ESTIMATORS)}."
             )
-    if reference.crs is not None and moving.crs is not None and reference.crs != moving.crs:
+    if reference.crs != moving.crs:
         raise UsageError(
             f"The surveys' CRS differ: {reference.crs} and {moving.crs}.",
             remedy="Bring the moving one to the other's with meshreg.io.frames.common_crs.",

@@ -24,7 +24,9 @@ NODES = 20  # along the overlap's side
 # Of the variance: internal warps are neither Gaussian nor alike everywhere, as kriging takes them
 # to be. Measured (`meshreg benchmark`, coverage of the stated region), not derived.
 MISFIT = 2.0
-RESOLUTION = 0.01  # cells: what sampling alone leaves open, alike for all tiles
+# Cells: what sampling alone leaves open, alike for all tiles, so that their scatter does not show
+# it; for peaks of correlation (a parabola through whole cells leans towards them), and polished.
+PEAK_RESOLUTION, RESOLUTION = 0.05, 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,9 +97,12 @@ def refine(
     assert rough.weights is not None
     kept = tiles.only(rough.weights > 0)
     best = over_ground(kept, ground, centre) if _enough(kept) else rough
+    cells = [moving.grid.cell for _, moving, _ in rasters]
+    best = _stated(best, PEAK_RESOLUTION * max(cells))
     for reference, moving, channel in rasters:
         if channel == "terrain":
             finer = _polished(reference, moving, ground, rough)
+            finer = None if finer is None else _stated(finer, RESOLUTION * moving.grid.cell)
             best = finer if finer is not None and _size(finer) < _size(best) else best
     if abs(best.yaw) > MAX_YAW:
         turn = np.rad2deg(best.yaw)
@@ -105,9 +110,13 @@ def refine(
     moved = float(np.hypot(*(best.offset - offset)))
     if moved > agree:
         return replace(coarse, doubt=f"tiles alone lie {moved:.2f} m from the whole's offset")
-    floor = (RESOLUTION * rasters[0][1].grid.cell) ** 2
-    covariance = MISFIT * best.covariance + np.diag([floor, floor, 0.0])
-    return replace(best, covariance=covariance)
+    return best
+
+
+def _stated(refined: Refined, resolution: float) -> Refined:
+    """Add to the covariance what the scatter of tiles does not show; `resolution` is in metres."""
+    floor = np.diag([resolution**2, resolution**2, 0.0])
+    return replace(refined, covariance=MISFIT * refined.covariance + floor)
 
 
 def _polished(

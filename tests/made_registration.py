@@ -140,11 +140,11 @@ def made_registration(verdict: str = "accepted") -> Registration:
     covariance[:6, :6] += 1e-9
     rejected = verdict == "rejected"
     before = {
-        "overlap": 0.95, "cells": 50_000, "height_median": -0.26, "height_nmad": 0.31,
+        "overlap": 0.95, "cells": 50_000, "height_median": 0.26, "height_nmad": 0.31,
         "height_rmse": 0.42, "image_similarity": 0.02,
     }  # fmt: skip
     after = {
-        "overlap": 0.88, "cells": 48_000, "height_median": 0.03, "height_nmad": 0.011,
+        "overlap": 0.88, "cells": 48_000, "height_median": -0.03, "height_nmad": 0.011,
         "height_rmse": 0.02, "image_similarity": 0.91,
     }  # fmt: skip
     return Registration(

@@ -146,9 +146,9 @@ def draw_height_difference(registration: Registration) -> Any:
         value = statistics.get(key)
         if value is None or not np.isfinite(value):
             continue
-        label = f"{name} {value:+.3f} m" if key == "height_median" else f"{name} {value:.3f} m"
-        middle = statistics.get("height_median") or 0.0
-        places = (value,) if key == "height_median" else (middle - value, middle + value)
+        label = f"{name} {-value:+.3f} m" if key == "height_median" else f"{name} {value:.3f} m"
+        middle = -(statistics.get("height_median") or 0.0)  # stated as reference less moving
+        places = (middle,) if key == "height_median" else (middle - value, middle + value)
         for index, at in enumerate(places):
             named = {"label": label} if index == 0 else {}
             side.axvline(at, color=color, linestyle=line, linewidth=1.3, **named)

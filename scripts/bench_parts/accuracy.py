@@ -11,7 +11,11 @@ from typing import Any
 import numpy as np
 
 PAIRS = 10
-OFFSETS = {"sfm.offset_length": 0.0, "sfm.offset_east": [-3.0, 3.0], "sfm.offset_north": [-3.0, 3.0]}
+OFFSETS = {
+    "sfm.offset_length": 0.0,
+    "sfm.offset_east": [-3.0, 3.0],
+    "sfm.offset_north": [-3.0, 3.0],
+}
 CASES: tuple[tuple[str, dict[str, Any]], ...] = (
     ("severity 0.6, no warp", {"severity": 0.6, "sfm.warp": 0.0, "sfm.doming": 0.0}),
     ("severity 0.9, no warp", {"severity": 0.9, "sfm.warp": 0.0, "sfm.doming": 0.0}),
@@ -98,7 +102,14 @@ def steps_on_a_real_reef() -> list[dict[str, Any]]:
             truth = 0.01 * np.array([col, -row])
             errors.append(float(np.hypot(*(found.offset - truth))) / 0.1)
     case = "real reef DEM, 11 × 11 shifts of tenths of a cell: cells"
-    return [{"case": case, "pairs": 121, "median cells": float(np.median(errors)), "worst cells": max(errors)}]
+    return [
+        {
+            "case": case,
+            "pairs": 121,
+            "median cells": float(np.median(errors)),
+            "worst cells": max(errors),
+        }
+    ]
 
 
 if __name__ == "__main__":
