@@ -103,7 +103,8 @@ def refine(
         if channel == "terrain":
             finer = _polished(reference, moving, ground, rough)
             finer = None if finer is None else _stated(finer, RESOLUTION * moving.grid.cell)
-            best = finer if finer is not None and _size(finer) < _size(best) else best
+            if finer is not None and _size(finer) < _size(best):
+                best = _with_surer_yaw(finer, best)
     if abs(best.yaw) > MAX_YAW:
         turn = np.rad2deg(best.yaw)
         return replace(coarse, doubt=f"the surveys are turned by about {turn:.1f}°, beyond ±1°")
@@ -159,6 +160,24 @@ def over_ground(tiles: TileOffsets, ground: Ground, pivot: Float64) -> Refined:
     left = offsets - offset - yaw * np.stack([-arm[:, 1], arm[:, 0]], axis=1)
     used = motion.used.astype(np.float64)
     return Refined(pivot, offset, yaw, covariance, tiles, left, used, motion.field)
+
+
+def _with_surer_yaw(refined: Refined, other: Refined) -> Refined:
+    """Take the yaw of another answer that is twice as sure of it.
+
+    Peaks of correlation may all lean the same way, which turns nothing.
+    """
+    if other.covariance[2, 2] > 0.25 * refined.covariance[2, 2]:
+        return refined
+    assert refined.tiles is not None
+    assert refined.residuals is not None
+    arm = refined.tiles.places - refined.pivot
+    more = other.yaw - refined.yaw
+    left = refined.residuals - more * np.stack([-arm[:, 1], arm[:, 0]], axis=1)
+    covariance = refined.covariance.copy()
+    covariance[2], covariance[:, 2] = 0.0, 0.0
+    covariance[2, 2] = other.covariance[2, 2]
+    return replace(refined, yaw=other.yaw, residuals=left, covariance=covariance)
 
 
 def _enough(tiles: TileOffsets | None) -> bool:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -108,7 +108,7 @@ def _last_line_end(data: UInt8) -> int:
 
 def in_order(
     blocks: Iterator[Block], work: Callable[[Block], _Result], n_bytes: int
-) -> Iterator[tuple[Block, _Result]]:
+) -> Generator[tuple[Block, _Result]]:
     """Work on blocks in threads; give blocks and results in the order of the file.
 
     `work` must not depend on earlier blocks, and gains where it holds no lock. Small files

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -84,9 +85,12 @@ def scan(path: Path) -> Scan:
     joiner = _Joiner(path)
     with open_regular(path) as stream:
         before = os.fstat(stream.fileno())
-        found = in_order(line_blocks(stream, path, hasher), Worker(), before.st_size)
-        for block, lines in found:
-            joiner.add(block, lines)
+        # closed here, not by the garbage collector, which may run in one of its own threads
+        with closing(
+            in_order(line_blocks(stream, path, hasher), Worker(), before.st_size)
+        ) as found:
+            for block, lines in found:
+                joiner.add(block, lines)
         after = os.fstat(stream.fileno())
     mark = (after.st_size, after.st_mtime_ns)
     if mark != (before.st_size, before.st_mtime_ns):

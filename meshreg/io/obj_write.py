@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -172,9 +173,10 @@ def rewrite(source: SourceFile, move: Mover, path: Path) -> tuple[Path, ...]:
             stream.seek(0)
             blocks = line_blocks(stream, source.path)
             size = max(source.fingerprint[0], 1)
-            for _, (text, points) in in_order(blocks, _mover_of_blocks(move, path), size):
-                out.write(text.data)
-                extent.add(points)
+            with closing(in_order(blocks, _mover_of_blocks(move, path), size)) as moved:
+                for _, (text, points) in moved:
+                    out.write(text.data)
+                    extent.add(points)
         again = scan(temporary)
         extent.require_equal(again.points, path, 1e-6)
         lost = [key for key, n in again.counts.items() if source.counts.get(key, n) != n]
