@@ -41,6 +41,8 @@ class RawGeometry:
     face_texture : (F,) int32 or None
         -1 where a face has no texture.
     textures : tuple of Texture
+    usable : (keep, notes) or None
+        What `usable_faces` says of `points` and `faces`, where the reader has asked it already.
     """
 
     points: NDArray[Any]
@@ -49,6 +51,7 @@ class RawGeometry:
     uv: NDArray[np.float32] | None = None
     face_texture: Int32 | None = None
     textures: tuple[Texture, ...] = ()
+    usable: tuple[Bool | None, tuple[str, ...]] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,12 +172,12 @@ def _keep_points(raw: RawGeometry, keep: Bool) -> RawGeometry:
         new = np.cumsum(keep, dtype=np.int32) - np.int32(1)
         faces = new[faces]
     colors = None if raw.colors is None else raw.colors[keep]
-    return replace(raw, points=raw.points[keep], faces=faces, colors=colors)
+    return replace(raw, points=raw.points[keep], faces=faces, colors=colors, usable=None)
 
 
 def _keep_faces(raw: RawGeometry, keep: Bool) -> RawGeometry:
     assert raw.faces is not None
-    changes: dict[str, Any] = {"faces": raw.faces[keep]}
+    changes: dict[str, Any] = {"faces": raw.faces[keep], "usable": None}
     if raw.uv is not None and raw.face_texture is not None:
         changes |= {"uv": raw.uv[keep], "face_texture": raw.face_texture[keep]}
     return replace(raw, **changes)
@@ -209,7 +212,7 @@ def _without_lost_points(raw: RawGeometry, path: Path) -> tuple[RawGeometry, tup
 def _without_idle_faces(raw: RawGeometry, path: Path) -> tuple[RawGeometry, tuple[str, ...]]:
     """Leave out faces without area and copies, then vertices that no face uses."""
     assert raw.faces is not None
-    keep, notes = usable_faces(np.asarray(raw.points, np.float64), raw.faces)
+    keep, notes = raw.usable or usable_faces(np.asarray(raw.points, np.float64), raw.faces)
     if keep is not None:
         raw = _keep_faces(raw, keep)
     assert raw.faces is not None

@@ -6,6 +6,7 @@ points, curves and normals of the file are not used; normals are turned when it 
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ from meshreg.io.mtl import Material, read_mtl
 from meshreg.io.obj_scan import Scan, line_of_face, scan
 from meshreg.io.obj_write import rewrite, write
 from meshreg.io.options import ReadOptions
-from meshreg.io.polygons import Triangles, triangulate
+from meshreg.io.polygons import Triangles, triangulate, usable_faces
 from meshreg.io.safe import MissingReferenceError, resolve_reference
 from meshreg.types import Float32, Int32, Survey, Texture, UInt8
 
@@ -79,13 +80,16 @@ def _geometry(
     notes += triangles.notes()
     faces = np.ascontiguousarray(triangles.pick_corners(found.vertex), np.int32)
     drape = _Drape(path, options)
-    if not options.geometry_only:
-        drape.open(found)
-    uv, pages = drape.lay(found, triangles)
+    with ThreadPoolExecutor(1) as other:  # a second core finds the idle faces meanwhile
+        usable = other.submit(usable_faces, found.points, faces)
+        if not options.geometry_only:
+            drape.open(found)
+        uv, pages = drape.lay(found, triangles)
     notes += drape.notes[:_MOST_NOTES]
     if len(drape.notes) > _MOST_NOTES:
         notes.append(f"{len(drape.notes) - _MOST_NOTES} more notes on materials were left out.")
-    raw = RawGeometry(found.points, faces, colors, uv, pages, tuple(drape.textures))
+    textures = tuple(drape.textures)
+    raw = RawGeometry(found.points, faces, colors, uv, pages, textures, usable.result())
     return raw, drape.companions
 
 

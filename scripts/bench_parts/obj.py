@@ -1,4 +1,4 @@
-"""OBJ: reading a textured mesh of 12 MB, best of 5 after a first read, each reader by itself.
+"""OBJ: reading a textured mesh of 12 MB, best of 15 after a first read, each reader by itself.
 
 Peak is how far the process's memory rose above where it stood; the texture page is not decoded.
 """
@@ -40,10 +40,10 @@ def make(folder: Path, rows: int, cols: int, name: str) -> Path:
 
 
 def _best(read: Callable[[str], Any], small: str, path: str) -> dict[str, Any]:
-    """Read once to compile and import, once for the memory, then report the fastest of five."""
+    """Read once to compile and import, once for the memory, then report the fastest of 15."""
     read(small)
     peak = measure.here(read, path)["peak_mb"]
-    return {"seconds": min(measure.timed(read, path) for _ in range(5)), "peak_mb": peak}
+    return {"seconds": min(measure.timed(read, path) for _ in range(15)), "peak_mb": peak}
 
 
 def meshreg(small: str, path: str) -> dict[str, Any]:
