@@ -18,7 +18,7 @@ def use_faces(points: Any, faces: Any, table: Any, keep: Any) -> tuple[int, int,
     points : (V, 3) float64
     faces : (F, 3) int32
     table : (2^k,) int32, all -1
-        At least twice as long as `faces`.
+        At least a quarter longer than `faces`.
     keep : (F,) bool
         Out: neither touches a vertex that is not finite, nor has no area, nor repeats the
         vertices of an earlier one, in whatever order.

@@ -92,6 +92,7 @@ def parse_plain(  # noqa: PLR0912, PLR0915  (one loop without calls, on purpose)
     vertex, uv, sizes = faces
     n_points, n_uvs, n_normals = state[VERTICES], state[UVS], state[NORMALS]
     n_faces, n_corners, lines = state[FACES], state[CORNERS], state[LINES]
+    with_uv, colored = state[WITH_UV], state[COLORED]
     while here < end:
         at = here + 1
         form, kind, after = 0, data[here], data[here + 1]
@@ -158,14 +159,15 @@ def parse_plain(  # noqa: PLR0912, PLR0915  (one loop without calls, on purpose)
             sizes[n_faces] = 3
             n_faces += 1
             n_corners += 3
-            state[WITH_UV] += form & 1
+            with_uv += form & 1
         elif kind == _T:
             n_uvs += 1
         elif kind == _N:
             n_normals += 1
         else:
             n_points += 1
-            state[COLORED] += form
+            colored += form
     state[VERTICES], state[UVS], state[NORMALS] = n_points, n_uvs, n_normals
     state[FACES], state[CORNERS], state[LINES] = n_faces, n_corners, lines
+    state[WITH_UV], state[COLORED] = with_uv, colored
     return here

@@ -165,7 +165,7 @@ def usable_faces(
     from meshreg.io.faces_kernels import use_faces
 
     faces = np.ascontiguousarray(faces, np.int32)
-    table = np.full(1 << int(2 * len(faces) - 1).bit_length(), -1, np.int32)
+    table = np.full(1 << int(1.25 * len(faces)).bit_length(), -1, np.int32)
     keep = np.empty(len(faces), np.bool_)
     lost, flat, copies = use_faces(np.ascontiguousarray(points, np.float64), faces, table, keep)
     notes = []
