@@ -23,7 +23,7 @@ MIN_TILES = 6
 NODES = 20  # along the overlap's side
 # Of the variance: internal warps are neither Gaussian nor alike everywhere, as kriging takes them
 # to be. Measured (`meshreg benchmark`, coverage of the stated region), not derived.
-MISFIT = 2.0
+MISFIT = 3.0
 # Cells: what sampling alone leaves open, alike for all tiles, so that their scatter does not show
 # it; for peaks of correlation (a parabola through whole cells leans towards them), and polished.
 PEAK_RESOLUTION, RESOLUTION = 0.05, 0.01

@@ -87,7 +87,7 @@ class JudgeSettings:
     min_overlap: float = 0.25  # of the smaller survey's cells; less goes to review
     support_gap: float = 1.5  # a channel that puts a place first by this much supports it
     accept_gap: float = 4.0
-    overwhelming_gap: float = 8.0
+    overwhelming_gap: float = 7.0
     max_false_alarm: float = 1e-6  # more is not accepted
     chance_false_alarm: float = 1e-3  # more is chance: rejected
 
