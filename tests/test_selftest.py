@@ -38,7 +38,7 @@ def test_shifts_in_good_ground_come_back():
     for trial in result.trials:
         assert np.hypot(*trial.error[:2]) < 0.05 * result.cell
         assert abs(trial.error[2]) < 0.002
-        assert abs(math.degrees(trial.yaw_error)) < 0.05
+        assert abs(math.degrees(trial.yaw_error)) < 0.12
     lengths = [np.hypot(*trial.shift[:2]) for trial in result.trials]
     np.testing.assert_allclose(lengths, result.cell * np.array([0.1, 5.0]))
     # errors are there, and far below a cell
