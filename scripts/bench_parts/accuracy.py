@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-PAIRS = 10
+PAIRS = 6
 OFFSETS = {
     "sfm.offset_length": 0.0,
     "sfm.offset_east": [-3.0, 3.0],
