@@ -16,11 +16,13 @@ from typing import Any
 import numpy as np
 
 from meshreg.offsets import neutral
+from meshreg.offsets.channels import smooth
 from meshreg.offsets.correlate import Correlator, Window
 from meshreg.offsets.surface import Peak, find_peak, gap_at
 from meshreg.settings import JudgeSettings, Settings
 from meshreg.types import Float64, OffsetEstimate, SurveyRaster, Verdict
 
+EXCHANGES = ((True, False), (False, True), (True, True))  # down, across
 TURNS = tuple((turn, flip) for turn in range(4) for flip in (False, True))[1:]
 SCORED_OVERLAP = 0.10  # of the largest: the neutral measure is fair to small overlaps
 TURN_NAMES = {
@@ -50,9 +52,12 @@ class ChannelMap:
         Cells of the smaller survey.
     peak : Peak or None
     null_gap : float
-        Mean gap of the mirrored and turned maps; the scale on which gaps are exponential.
+        Mean gap of the maps that have no true match: the moving survey mirrored or turned, or its
+        halves exchanged; the scale on which gaps are exponential.
     turned : mapping
         Gap of each mirrored or turned map, by its name.
+    exchanged : tuple of float
+        Gaps of the maps whose tiles lie beside the wrong ones.
     """
 
     name: neutral.Channel
@@ -63,6 +68,7 @@ class ChannelMap:
     peak: Peak | None
     null_gap: float
     turned: Mapping[str, float]
+    exchanged: tuple[float, ...] = ()
 
     def false_alarm(self, gap: float) -> float:
         """Chance that a wrong peak stands out by `gap`: exponential in units of the null gap."""
@@ -143,7 +149,34 @@ def judge(
     hypotheses = tuple(sorted(_merge(candidates, maps, reach), key=lambda h: h.score, reverse=True))
     if not hypotheses:
         return Judgement("rejected", "no method found a candidate", None, maps=maps)
-    return _verdict(hypotheses, maps, settings.judge, radius, reach, trials)
+    reliefs = [relief_of(raster) for raster in rasters["dem"]]
+    flat = _flat(reliefs, settings.judge.flat_relief)
+    return _verdict(hypotheses, maps, settings.judge, radius, reach, trials, flat)
+
+
+def relief_of(raster: SurveyRaster) -> float:
+    """Return the range [m] of 98 % of the heights about their surroundings (5 cells)."""
+    rows, cols = np.nonzero(raster.valid)
+    if len(rows) < 3:
+        return 0.0
+    # without its plane a slope would show as relief at the survey's rim
+    design = np.stack([np.ones(len(rows)), rows, cols], axis=1)
+    found = raster.height[raster.valid].astype(np.float64)
+    found -= design @ np.linalg.lstsq(design, found, rcond=None)[0]
+    height = np.zeros(raster.valid.shape)
+    height[raster.valid] = found
+    found -= smooth(height, raster.valid, 5.0)[raster.valid]
+    return float(np.subtract(*np.quantile(found, (0.99, 0.01))))
+
+
+def _flat(reliefs: Sequence[float], limit: float) -> str:
+    """Name the surveys, reference and moving, that have no relief to be known by; or ''."""
+    flat = [
+        f"the {name} survey is flat (98 % of it within {relief * 100:.1f} cm)"
+        for name, relief in zip(("reference", "moving"), reliefs, strict=True)
+        if relief < limit
+    ]
+    return " and ".join(flat)
 
 
 def agree_distance(settings: JudgeSettings, dem_cell: float) -> float:
@@ -169,37 +202,54 @@ def channel_map(
     first, second = neutral.fields(reference, channel), neutral.fields(moving, channel)
     transformed: dict[tuple[int, int], neutral.Spectra] = {}
 
-    def look(turn: int, flip: bool) -> tuple[Window, Float64, Float64, Peak | None] | None:
-        """Evidence and its peak, with the moving survey turned and mirrored."""
+    def look(
+        other: neutral.Fields, turn: int = 0, apart: Sequence[tuple[float, float]] = ()
+    ) -> tuple[Window, Float64, Float64, Peak | None] | None:
+        """Evidence and its peak, for a changed moving survey; none within reach of `apart`."""
         window = Window.around(reference.grid, neutral.turned_grid(moving.grid, turn), radius)
         if window.empty:
             return None
         correlator = Correlator(window, single=True)
         if window.padded not in transformed:
             transformed[window.padded] = neutral.spectra(first, correlator)
-        other = neutral.spectra(second.turned(turn, flip), correlator)
+        changed = neutral.spectra(other, correlator)
         surface, counts = neutral.surface(
-            transformed[window.padded], other, correlator, min_overlap
+            transformed[window.padded], changed, correlator, min_overlap
         )
         exclusion = max(0.5, 5 * window.cell)
+        for east, north in apart:
+            away = np.hypot(window.east[None, :] - east, window.north[:, None] - north)
+            surface[away < 3 * exclusion] = np.nan
         return window, surface, counts, find_peak(surface, window.east, window.north, exclusion)
 
-    seen = look(0, False)
+    seen = look(second)
     if seen is None or seen[3] is None:
         return None
     window, surface, counts, peak = seen
     turned: dict[str, float] = {}
     for turn, flip in TURNS:
-        null = look(turn, flip)
+        null = look(second.turned(turn, flip), turn)
         if null is not None and null[3] is not None:
             turned[TURN_NAMES[turn, flip]] = null[3].gap
+    exchanged: list[float] = []
+    for down, across in EXCHANGES:
+        other, steps = second.exchanged(down, across)
+        # what was moved down and right matches the reference that much further up and left
+        true = [
+            (peak.east - col * window.cell, peak.north + row * window.cell) for row, col in steps
+        ]
+        null = look(other, apart=true)
+        if null is not None and null[3] is not None:
+            exchanged.append(null[3].gap)
     # The theory of extremes gives 1/sqrt(2 ln M) for M independent offsets: about 0.3. A map
     # that matches by chance of symmetry (or because the survey IS mirrored) must not widen the
     # scale for the rest, hence the median; ln 2 turns an exponential's median into its mean.
-    gaps = list(turned.values())
+    gaps = [*turned.values(), *exchanged]
     null_gap = max(float(np.median(gaps)) / math.log(2) if gaps else 0.0, 0.3)
     smaller = min(int(mask.sum()) for mask in valid)
-    return ChannelMap(channel, window, surface, counts, smaller, peak, null_gap, turned)
+    return ChannelMap(
+        channel, window, surface, counts, smaller, peak, null_gap, turned, tuple(exchanged)
+    )
 
 
 def _candidates(
@@ -297,6 +347,7 @@ def _verdict(
     radius: float,
     reach: float,
     trials: int,
+    flat: str,
 ) -> Judgement:
     best = hypotheses[0]
     alarm = min(1.0, trials * _false_alarm(best, maps, radius, reach))
@@ -321,6 +372,11 @@ def _verdict(
         where = " and ".join(contradicting)
         return say(
             "review", f"the channels contradict each other: {where} fits elsewhere ({words})"
+        )
+    if alarm > settings.chance_false_alarm and flat:
+        return say(
+            "review",
+            f"{flat}: too little to know the place by, or to tell it from another ({words})",
         )
     if alarm > settings.chance_false_alarm:
         return say(

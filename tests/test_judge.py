@@ -8,9 +8,11 @@ import functools
 import numpy as np
 import pytest
 import seafloor
+from scipy import ndimage
 
-from meshreg.judge import TURN_NAMES, channel_map, judge
+from meshreg.judge import TURN_NAMES, channel_map, judge, relief_of
 from meshreg.offsets import estimate_offsets
+from meshreg.offsets.neutral import fields
 from meshreg.settings import Settings
 from meshreg.types import OffsetEstimate, SurveyRaster
 
@@ -153,3 +155,86 @@ def test_the_joined_offset_lies_among_its_members():
     assert {"sift", "terrain"} <= set(judged.best.methods)
     assert abs(judged.best.east - OFFSET[0]) < 0.06
     assert abs(judged.best.north - OFFSET[1]) < 0.06
+
+
+def flattened(raster: SurveyRaster, height: float, seed: int) -> SurveyRaster:
+    """Bare ground: hummocks of `height` [m] that do not stay in their place, and grey grain."""
+    rng = np.random.default_rng(seed)
+    shape = raster.grid.shape
+    hummocks = ndimage.gaussian_filter(rng.normal(size=shape), 2.0)
+    grain = ndimage.gaussian_filter(rng.normal(size=shape), 1.0)
+    color = np.clip(120 + 60 * grain, 0, 255).astype(np.uint8)
+    return dataclasses.replace(
+        raster,
+        height=height * hummocks / hummocks.std(),
+        color=np.repeat(color[..., None], 3, axis=2),
+    )
+
+
+@pytest.mark.parametrize(("height", "expected"), [(0.015, "review"), (0.15, "rejected")])
+@pytest.mark.parametrize("seed", [1, 2])
+def test_flat_ground_is_not_taken_for_another_place(seed, height, expected):
+    """Where all that is there is mobile, nothing fits: on sand that does not mean elsewhere."""
+    pairs = pair(seed)
+    rasters = {
+        name: (flattened(a, height, 10 * seed), flattened(b, height, 10 * seed + 1))
+        for name, (a, b) in pairs.items()
+    }
+    judged = verdict(rasters)
+    assert judged.verdict == expected
+    said = "reference survey is flat" in judged.reason and "moving survey is flat" in judged.reason
+    assert said == (expected == "review")
+    # one flat survey is enough: the bedforms of the other may have come since
+    mixed = verdict({name: (pairs[name][0], rasters[name][1]) for name in rasters})
+    assert mixed.verdict == expected
+    assert "reference survey is flat" not in mixed.reason
+
+
+def test_relief_is_the_range_about_the_surroundings():
+    raster = pair(1)["dem"][0]
+    rows, cols = np.indices(raster.grid.shape)
+    tilted = 3.0 + 0.05 * rows - 0.02 * cols  # a slope is no relief
+    plain = dataclasses.replace(raster, height=tilted, valid=np.ones(rows.shape, bool))
+    assert relief_of(plain) < 1e-5  # heights are float32
+    bumps = dataclasses.replace(plain, height=tilted + 0.2 * ((rows + cols) % 2))
+    assert relief_of(bumps) == pytest.approx(0.2, rel=0.03)
+    assert relief_of(dataclasses.replace(plain, valid=rows < 0)) == 0.0
+
+
+@pytest.mark.parametrize(("down", "across"), [(True, False), (False, True), (True, True)])
+def test_exchanged_parts_lie_where_the_steps_say(down, across):
+    """Every cell of the exchanged fields is a cell of the former ones, one of the steps away."""
+    raster = pair(1)["dem"][1]
+    mask = np.zeros(raster.grid.shape, bool)
+    mask[7:108, 11:140] = True  # odd and even; not the whole grid
+    before = fields(dataclasses.replace(raster, valid=raster.valid & mask), "terrain")
+    after, steps = before.exchanged(down, across)
+    assert len(steps) == 2 ** (down + across)
+    assert (0, 0) not in steps
+    sources = np.zeros(mask.shape, int)
+    for row, col in steps:
+        sources += shifted(before.mask, row, col) & (
+            shifted(before.parts[0][0], row, col) == after.parts[0][0]
+        )
+    assert (sources[after.mask] == 1).mean() > 0.99
+    assert after.mask.sum() == before.mask.sum()
+
+
+def shifted(array, row, col):
+    """The array moved by whole cells; what comes from outside is zero."""
+    moved = np.zeros_like(array)
+    height, width = array.shape
+    moved[max(row, 0) : height + min(row, 0), max(col, 0) : width + min(col, 0)] = array[
+        max(-row, 0) : height - max(row, 0), max(-col, 0) : width - max(col, 0)
+    ]
+    return moved
+
+
+def test_chance_is_measured_without_the_true_match():
+    """Exchanged halves of a true pair still match in part, further off: that is not chance."""
+    for seed in (1, 2, 3):
+        for channel, name in (("terrain", "dem"), ("image", "ortho")):
+            found = channel_map(*pair(seed, 0.1)[name], channel, 5.0, 0.1)
+            assert found.peak.gap > 10
+            assert len(found.exchanged) == 3
+            assert max(found.exchanged) < 3

@@ -3,8 +3,8 @@
 Terrain and image are each reduced to a few change-resistant fields (`channels`). A field's
 correlation over the overlap, ``C / sqrt(Q1 Q2) * sqrt(N)``, has the same spread under chance at
 every overlap N; fields of one channel are added in units of that spread. What chance can do on
-this very ground is measured on the same two surveys with the moving one mirrored and turned:
-same texture, same holes, no true match.
+this very ground is measured on the same two surveys with the moving one mirrored, turned, or cut
+into halves or quarters that change places: same texture, same holes, no true match.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from meshreg.types import Bool, Float64, Grid, SurveyRaster
 Channel = Literal["terrain", "image"]
 Kind = Literal["scalar", "vector", "director"]
 Parts = tuple[Float64, ...]
+Step = tuple[int, int]
 
 
 @dataclass(frozen=True)
@@ -55,6 +56,28 @@ class Fields:
             return np.ascontiguousarray(np.fliplr(array) if flip else array)
 
         return Fields(self.mask, parts, kinds).mapped(moved)
+
+    def exchanged(self, down: bool, across: bool) -> tuple[Fields, tuple[Step, ...]]:
+        """Return the fields with their halves (both: quarters) in each other's place, and how far.
+
+        The steps are the whole numbers of rows and columns by which the parts were moved; where a
+        survey has a true match, the exchanged one has a part of it at each of them.
+        """
+        rows, cols = (np.flatnonzero(self.mask.any(axis=axis)) for axis in (1, 0))
+        if not rows.size:
+            return self, ((0, 0),)
+        box = np.s_[rows[0] : rows[-1] + 1, cols[0] : cols[-1] + 1]
+        height, width = rows[-1] + 1 - rows[0], cols[-1] + 1 - cols[0]
+        half = int(height // 2 * down), int(width // 2 * across)
+
+        def moved(array: Any) -> Any:
+            array = array.copy()
+            array[box] = np.roll(array[box], half, (0, 1))
+            return array
+
+        steps = (half[0], half[0] - int(height)), (half[1], half[1] - int(width))
+        places = [axis if step else (0,) for axis, step in zip(steps, half, strict=True)]
+        return self.mapped(moved), tuple((row, col) for row in places[0] for col in places[1])
 
 
 def _quarter_turn(kind: Kind, parts: Parts) -> Parts:

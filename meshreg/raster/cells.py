@@ -14,7 +14,8 @@ from meshreg.types import PointCloud, Survey
 
 PAPER_DEM_CELL = 0.10  # Bryson et al. 2013, III-C
 PAPER_ORTHO_CELL = 0.05  # III-D
-FINEST_SIFT_CELL = 0.01
+FINEST_SIFT_CELL = 0.02  # or a thousand to the ground's width, down to the next
+FINEST_SMALL_CELL = 0.01
 
 
 @dataclass(frozen=True)
@@ -40,8 +41,9 @@ def choose_cells(
     the texels; and finer where the patch is under 5 m across (50 cells at least) or its points are
     under 2 mm apart. It has one digit. The orthomosaic has half that cell,
     or the same where the texels are no finer.
-    SIFT works at the coarser texture's spacing, not finer than 0.01 m and not coarser than the
-    orthomosaic, and coarsens where its raster would have over a quarter of `settings.max_cells`.
+    SIFT works at the coarser texture's spacing, but not finer than 0.02 m (on ground under 20 m
+    across: than a thousandth of it, and not than 0.01 m) and not coarser than the orthomosaic, and
+    coarsens where its raster would have over a quarter of `settings.max_cells`.
 
     Raises
     ------
@@ -107,12 +109,13 @@ def _default_sift_cell(
     settings: RasterSettings,
     notes: list[str],
 ) -> float:
-    finest = FINEST_SIFT_CELL
+    area = max(_across(survey) ** 2 for survey, _ in pair)
+    # finer images than these show more features than are kept (sift.max_features)
+    finest = float(np.clip(math.sqrt(area) / 1000, FINEST_SMALL_CELL, FINEST_SIFT_CELL))
     for survey, spacing in pair:
         cloud = isinstance(survey.geometry, PointCloud)
         finest = max(finest, 1.5 * spacing.points if cloud else spacing.texels or spacing.points)
     times = max(1, math.floor(ortho / finest + 0.01))
-    area = max(_across(survey) ** 2 for survey, _ in pair)
     most = max(1, math.floor(ortho * math.sqrt(0.25 * settings.max_cells / area)))
     if most < times:
         notes.append(

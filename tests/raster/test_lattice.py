@@ -110,8 +110,15 @@ def cells_of(survey, **chosen):
 
 def test_a_survey_like_the_paper_gets_the_paper_cells():
     cells = cells_of(draped(np.zeros((2000, 2000, 3), np.uint8), 20.0, 20.0, n=400))
-    assert (cells.dem, cells.ortho, cells.sift) == (0.10, 0.05, 0.01)
+    assert (cells.dem, cells.ortho, cells.sift) == (0.10, 0.05, 0.025)
     assert cells.notes == ()
+
+
+def test_sift_sees_small_ground_more_finely():
+    """Not more than a thousandth of the width, and never finer than the texels."""
+    for size, expected in ((8.0, 0.01), (12.0, 0.0125), (16.0, 0.05 / 3), (30.0, 0.025)):
+        image = np.zeros((2500, 2500, 3), np.uint8)
+        assert cells_of(draped(image, size, size, n=300)).sift == pytest.approx(expected)
 
 
 def test_coarse_data_get_coarse_cells_and_a_reason():
@@ -179,10 +186,10 @@ def test_what_the_user_says_wins(dem, ortho, sift):
 
 def test_a_wide_survey_coarsens_sift_and_says_so():
     image = np.zeros((4000, 4000, 3), np.uint8)
-    cells = cells_of(draped(image, 40.0, 40.0, n=500), max_cells=16_000_000)
-    assert cells.sift == pytest.approx(0.025)  # 1600² of a quarter of 16 million
-    assert "SIFT cell 0.025 m instead of 0.01 m" in cells.notes[-1]
-    assert "16,000,000" in cells.notes[-1]
+    cells = cells_of(draped(image, 40.0, 40.0, n=500), max_cells=4_000_000)
+    assert cells.sift == pytest.approx(0.05)  # 1000² of a quarter of 4 million would do
+    assert "SIFT cell 0.05 m instead of 0.025 m" in cells.notes[-1]
+    assert "4,000,000" in cells.notes[-1]
 
 
 @pytest.mark.parametrize("name", ["dem_cell", "ortho_cell", "sift_cell"])
