@@ -31,15 +31,17 @@ RULES: dict[str, set[str]] = {
     "surfaces": BASE,
     "apply": BASE,
     "report": BASE,
-    "ladder": BASE,
+    "held_out": BASE,
+    "ladder": BASE | {"held_out"},
     "warp_rasters": BASE,
     "warp": BASE | {"ladder", "tiles", "warp_rasters"},
     "statistics": BASE | {"raster", "offsets"},
-    "offsets": BASE | {"jit", "raster"},
+    "offsets": BASE | {"jit", "kriging", "raster"},
+    "calibration": set(),
     "judge": BASE | {"raster", "offsets"},
     "pipeline": BASE
     | {"raster", "offsets", "judge", "refine", "heights", "surfaces", "warp", "apply", "statistics"}
-    | {"voting", "heading", "warp_rasters"},
+    | {"voting", "heading", "warp_rasters", "calibration"},
     "ties": BASE | {"io", "raster", "offsets", "statistics", "report"},
     "doctor": set(),
 }

@@ -100,7 +100,7 @@ def of_registration(
         if covariance is not None:
             covariance = covariance[np.ix_([0, 1, 5], [0, 1, 5])]
         answer = Answer(transform.pivot[:2], transform.offset[:2], turn, covariance)
-    alarm = float(registration.evidence.get("false_alarm", 1.0))
+    alarm = 1.0 if registration.false_alarm is None else registration.false_alarm
     verdict = _Verdict(registration.verdict, registration.reason, alarm)
     first = registration.hypotheses[0] if registration.hypotheses else {}
     gaps = {c: first[f"{c}_gap"] for c in first.get("channels", ())}

@@ -53,6 +53,8 @@ def registration_document(registration: Registration) -> dict[str, Any]:
         "offset": offset,
         "covariance": None if covariance is None else covariance.tolist(),
         "registration_error": registration.registration_error,
+        "false_alarm": registration.false_alarm,
+        "probability": registration.probability,
         "internal": registration.internal,
         "warp": None if registration.warp is None else _warp_document(registration.warp),
         "methods": {e.method: _estimate_document(e) for e in registration.estimates},
@@ -256,6 +258,8 @@ def _registration(document: dict[str, Any], path: Path) -> Registration:
             notes=tuple(str(note) for note in document["notes"]),
             registration_error=document.get("registration_error"),
             internal=document.get("internal"),
+            false_alarm=document.get("false_alarm"),
+            probability=document.get("probability"),
             warp=_warp(document.get("warp")),
         )
     except UsageError as error:  # a record refused at birth; here the file is to blame
