@@ -203,6 +203,7 @@ def _survey(take: Take, scene: Scene, kind: str, tell: Progress) -> Survey:
     tell(f"{take.name} geometry", 0.0)
     # a local frame near the patch, as software that calculates in float32 asks for
     origin = np.array([100.0, 100.0, 0.0]) * np.floor(take.distortion.start / [100.0, 100.0, 1.0])
+    origin += 0.0  # so that no -0.0 is left of 0 times a depth
     geometry: Any
     if kind in ("ply-cloud", "laz"):
         geometry = cloud(take, view, output.point_spacing, origin)

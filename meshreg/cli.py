@@ -8,20 +8,47 @@ from __future__ import annotations
 
 import sys
 import traceback
-from collections.abc import Sequence
-from enum import StrEnum
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 
 from meshreg import __version__
-from meshreg.cli_parts.options import for_both, join_settings, read_options
+from meshreg.cli_parts.arguments import (
+    AxesOption,
+    ConfigOption,
+    DebugOption,
+    DemCellOption,
+    GeometryOnlyOption,
+    JsonOption,
+    MaskOption,
+    MaybeOutOption,
+    OrthoCellOption,
+    OutOption,
+    OverwriteOption,
+    PositionsListOption,
+    PositionsOption,
+    Preset,
+    ReferenceArgument,
+    ResultArgument,
+    ScaleOption,
+    ScalesOption,
+    SetOption,
+    ShiftOption,
+    SurveyArgument,
+    UnitOption,
+    UpOption,
+    WarpModel,
+)
+from meshreg.cli_parts.options import join_settings, survey_request, survey_requests
 from meshreg.errors import MeshregError, UsageError
 
 if TYPE_CHECKING:
     from meshreg.cli_parts.console import Voice
+    from meshreg.cli_parts.guard import Unfinished
 
+Result = TypeVar("Result")
 # Typer carries its own click or uses the installed one; this is the root of its errors either way.
 _ClickError = typer.BadParameter.__mro__[2]
 
@@ -33,75 +60,6 @@ app = typer.Typer(
     rich_markup_mode="markdown",
     help="Register repeat surveys of the seafloor straight from structure-from-motion exports.",
 )
-
-
-class Axes(StrEnum):
-    """What a file's x, y, z are."""
-
-    enu = "enu"
-    ned = "ned"
-
-
-class Up(StrEnum):
-    """Which axis of a file points up."""
-
-    y = "y"
-    z = "z"
-
-
-class Preset(StrEnum):
-    """Methods as they work best, or exactly as published."""
-
-    robust = "robust"
-    paper = "paper"
-
-
-class WarpModel(StrEnum):
-    """How the moving survey may be bent after its rigid move."""
-
-    none = "none"
-    auto = "auto"
-    similarity = "similarity"
-    dome = "dome"
-    quadratic = "quadratic"
-    spline = "spline"
-
-
-_SHIFT = "Add to its coordinates in metres; replaces a sidecar's shift."
-OutOption = Annotated[Path, typer.Option("--out", "-o", help="Folder for the result.")]
-AxesOption = Annotated[Axes | None, typer.Option(help="Axes of the file(s): enu, or ned (ACFR).")]
-UpOption = Annotated[Up | None, typer.Option(help="Axis of the file(s) that points up.")]
-UnitOption = Annotated[str | None, typer.Option(help="Unit of the file(s): m, cm, mm, ft, us-ft.")]
-JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON document, nothing else.")]
-DebugOption = Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")]
-OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace a former result.")]
-SetOption = Annotated[
-    list[str] | None,
-    typer.Option("--set", metavar="STAGE.NAME=VALUE", help="Any other setting; repeatable."),
-]
-ConfigOption = Annotated[
-    Path | None, typer.Option("--config", metavar="FILE.toml", help="Settings from a file.")
-]
-MaskOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--mask",
-        metavar="[reference:|moving:][not:]FILE",
-        help="Raster or polygons of what to use, or not; repeatable.",
-    ),
-]
-ScaleOption = Annotated[
-    list[float] | None,
-    typer.Option(help="Metres per unit of a COLMAP model; give twice for reference and moving."),
-]
-PositionsOption = Annotated[
-    list[Path] | None,
-    typer.Option(help="Camera positions of a COLMAP model (CSV); twice for reference and moving."),
-]
-DemCellOption = Annotated[float | None, typer.Option(help="DEM cell in metres; from the data.")]
-OrthoCellOption = Annotated[
-    float | None, typer.Option(help="Mosaic cell in metres; from the data.")
-]
 
 
 @app.callback(invoke_without_command=True)
@@ -117,11 +75,11 @@ def _root(
 
 @app.command()
 def register(
-    reference: Annotated[str, typer.Argument(help="Original survey: file, folder or quoted glob.")],
+    reference: ReferenceArgument,
     moving: Annotated[str, typer.Argument(help="Repeat survey, laid on the reference.")],
     out: OutOption,
-    reference_shift: Annotated[str | None, typer.Option(metavar="E,N,U", help=_SHIFT)] = None,
-    moving_shift: Annotated[str | None, typer.Option(metavar="E,N,U", help=_SHIFT)] = None,
+    reference_shift: ShiftOption = None,
+    moving_shift: ShiftOption = None,
     axes: AxesOption = None,
     up: UpOption = None,
     unit: UnitOption = None,
@@ -145,8 +103,9 @@ def register(
     config: ConfigOption = None,
     changes: SetOption = None,
     seed: Annotated[int | None, typer.Option(help="Seed of every random draw; 0.")] = None,
-    scale: ScaleOption = None,
-    positions: PositionsOption = None,
+    scale: ScalesOption = None,
+    positions: PositionsListOption = None,
+    geometry_only: GeometryOnlyOption = False,
     ties: Annotated[
         str | None, typer.Option(metavar="FILE", help="Points picked by hand, one more method.")
     ] = None,
@@ -163,8 +122,8 @@ def register(
     NAME.survey.toml beside each file.
     """
     del debug
-    from meshreg.cli_parts.common import SurveyRequest
-    from meshreg.cli_parts.registering import RegisterRequest
+    from meshreg.cli_parts import registering, result
+    from meshreg.io.document import registration_document
 
     settings = join_settings(
         preset,
@@ -180,64 +139,55 @@ def register(
             "seed": seed,
         },
     )
-    scales, places = for_both("--scale", scale), for_both("--positions", positions)
-    shared = {"axes": axes, "up": up, "unit": unit}
-    options = [
-        read_options(shift, name, **shared, scale=scales[k], positions=places[k])
-        for k, (shift, name) in enumerate(
-            ((reference_shift, "--reference-shift"), (moving_shift, "--moving-shift"))
-        )
-    ]
-    request = RegisterRequest(
-        SurveyRequest(reference, options[0]),
-        SurveyRequest(moving, options[1]),
+    surveys = survey_requests(
+        (reference, moving),
+        (reference_shift, moving_shift),
+        scale,
+        positions,
+        axes=axes,
+        up=up,
+        unit=unit,
+        geometry_only=geometry_only,
+    )
+    request = registering.RegisterRequest(
+        *surveys,
         out,
         tuple(mask or ()),
         settings,
         overwrite,
         ties,
     )
-    return _do_register(request, _voice(as_json))
-
-
-def _do_register(request: Any, voice: Voice) -> int:
-    from meshreg.cli_parts import registering, result
-    from meshreg.cli_parts.guard import run_stoppable
-    from meshreg.io.document import registration_document
-
-    registration = run_stoppable(
-        lambda unfinished: registering.register(request, voice, unfinished)
+    registration = _done(
+        as_json,
+        lambda voice, unfinished: registering.register(request, voice, unfinished),
+        lambda registration, voice: result.show(registration, out, voice),
+        registration_document,
     )
-    if voice.as_json:
-        voice.document(registration_document(registration))
-    else:
-        result.show(registration, request.out, voice)
     return 0 if registration.verdict == "accepted" else 4
 
 
 @app.command()
 def report(
-    out: Annotated[Path, typer.Argument(help="Folder that `register` wrote.")],
+    out: ResultArgument,
     as_json: JsonOption = False,
     debug: DebugOption = False,
 ) -> int:
     """Make report.html of a result again, from what was saved in its folder."""
     del debug
     from meshreg.cli_parts import reporting
-    from meshreg.cli_parts.guard import run_stoppable
 
-    voice = _voice(as_json)
-    page = run_stoppable(lambda unfinished: reporting.write_report(out))
-    if as_json:
-        voice.document(reporting.document(page))
-    else:
-        reporting.show(page, voice)
+    _done(
+        as_json,
+        lambda voice, unfinished: reporting.write_report(out),
+        reporting.show,
+        reporting.document,
+    )
     return 0
 
 
 @app.command()
 def view(
-    out: Annotated[Path, typer.Argument(help="Folder that `register` wrote.")],
+    out: ResultArgument,
     as_json: JsonOption = False,
     debug: DebugOption = False,
 ) -> int:
@@ -252,17 +202,18 @@ def view(
 
 @app.command()
 def rasterize(
-    survey: Annotated[str, typer.Argument(help="File, folder or quoted glob.")],
+    survey: SurveyArgument,
     out: OutOption,
-    shift: Annotated[str | None, typer.Option(metavar="E,N,U", help=_SHIFT)] = None,
+    shift: ShiftOption = None,
     axes: AxesOption = None,
     up: UpOption = None,
     unit: UnitOption = None,
     mask: MaskOption = None,
     dem_cell: DemCellOption = None,
     ortho_cell: OrthoCellOption = None,
-    scale: Annotated[float | None, typer.Option(help="Metres per unit of a COLMAP model.")] = None,
-    positions: Annotated[Path | None, typer.Option(help="Its camera positions (CSV).")] = None,
+    scale: ScaleOption = None,
+    positions: PositionsOption = None,
+    geometry_only: GeometryOnlyOption = False,
     config: ConfigOption = None,
     changes: SetOption = None,
     overwrite: OverwriteOption = False,
@@ -272,23 +223,25 @@ def rasterize(
     """Turn a survey into a DEM and an orthomosaic (GeoTIFF, cloud-optimized)."""
     del debug
     from meshreg.cli_parts import mapping
-    from meshreg.cli_parts.common import SurveyRequest
-    from meshreg.cli_parts.guard import run_stoppable
 
     cells = {"raster.dem_cell": dem_cell, "raster.ortho_cell": ortho_cell}
     settings = join_settings(None, config, changes, cells)
-    options = read_options(
-        shift, "--shift", axes=axes, up=up, unit=unit, scale=scale, positions=positions
+    named = survey_request(
+        survey,
+        shift,
+        axes=axes,
+        up=up,
+        unit=unit,
+        scale=scale,
+        positions=positions,
+        geometry_only=geometry_only,
     )
-    request = mapping.RasterizeRequest(
-        SurveyRequest(survey, options), out, tuple(mask or ()), settings, overwrite
+    request = mapping.RasterizeRequest(named, out, tuple(mask or ()), settings, overwrite)
+    _done(
+        as_json,
+        lambda voice, unfinished: mapping.rasterize(request, voice, unfinished),
+        mapping.show_maps,
     )
-    voice = _voice(as_json)
-    document = run_stoppable(lambda unfinished: mapping.rasterize(request, voice, unfinished))
-    if as_json:
-        voice.document(document)
-    else:
-        mapping.show_maps(document, voice)
     return 0
 
 
@@ -297,10 +250,11 @@ def apply(
     registration: Annotated[Path, typer.Argument(help="registration.json, or its folder.")],
     survey: Annotated[str, typer.Argument(help="Any further file of the same moving survey.")],
     out: OutOption,
-    shift: Annotated[str | None, typer.Option(metavar="E,N,U", help=_SHIFT)] = None,
+    shift: ShiftOption = None,
     axes: AxesOption = None,
     up: UpOption = None,
     unit: UnitOption = None,
+    geometry_only: GeometryOnlyOption = False,
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
     debug: DebugOption = False,
@@ -308,44 +262,46 @@ def apply(
     """Move any further file of the same survey by a registration that was found."""
     del debug
     from meshreg.cli_parts import applying
-    from meshreg.cli_parts.common import SurveyRequest
-    from meshreg.cli_parts.guard import run_stoppable
 
-    options = read_options(shift, "--shift", axes=axes, up=up, unit=unit)
-    request = applying.ApplyRequest(registration, SurveyRequest(survey, options), out, overwrite)
-    voice = _voice(as_json)
-    document = run_stoppable(lambda unfinished: applying.apply(request, voice, unfinished))
-    if as_json:
-        voice.document(document)
-    else:
-        applying.show_applied(document, voice)
+    named = survey_request(survey, shift, axes=axes, up=up, unit=unit, geometry_only=geometry_only)
+    request = applying.ApplyRequest(registration, named, out, overwrite)
+    _done(
+        as_json,
+        lambda voice, unfinished: applying.apply(request, voice, unfinished),
+        applying.show_applied,
+    )
     return 0
 
 
 @app.command()
 def info(
-    survey: Annotated[str, typer.Argument(help="File, folder or quoted glob.")],
-    shift: Annotated[str | None, typer.Option(metavar="E,N,U", help=_SHIFT)] = None,
+    survey: SurveyArgument,
+    shift: ShiftOption = None,
     axes: AxesOption = None,
     up: UpOption = None,
     unit: UnitOption = None,
+    scale: ScaleOption = None,
+    positions: PositionsOption = None,
+    geometry_only: GeometryOnlyOption = False,
     as_json: JsonOption = False,
     debug: DebugOption = False,
 ) -> int:
     """Say what is in a survey: counts, bounds, spacing, textures, CRS, up axis and unit."""
     del debug
     from meshreg.cli_parts import info as describing
-    from meshreg.cli_parts.common import SurveyRequest, read
-    from meshreg.cli_parts.guard import run_stoppable
+    from meshreg.cli_parts.common import read
 
-    options = read_options(shift, "--shift", axes=axes, up=up, unit=unit)
-    request = SurveyRequest(survey, options)
-    voice = _voice(as_json)
-    document = run_stoppable(lambda unfinished: describing.describe(read(request)))
-    if as_json:
-        voice.document(document)
-    else:
-        describing.show(document, voice)
+    request = survey_request(
+        survey,
+        shift,
+        axes=axes,
+        up=up,
+        unit=unit,
+        scale=scale,
+        positions=positions,
+        geometry_only=geometry_only,
+    )
+    _done(as_json, lambda voice, unfinished: describing.describe(read(request)), describing.show)
     return 0
 
 
@@ -354,23 +310,15 @@ def doctor(as_json: JsonOption = False, debug: DebugOption = False) -> int:
     """Say what this machine lacks, and the command that brings it."""
     del debug
     from meshreg.cli_parts import machine
-    from meshreg.cli_parts.guard import run_stoppable
     from meshreg.doctor import examine
 
-    voice = _voice(as_json)
-    checks = run_stoppable(lambda unfinished: examine())
-    if as_json:
-        voice.document(machine.document(checks))
-    else:
-        machine.show(checks, voice)
+    checks = _done(as_json, lambda voice, unfinished: examine(), machine.show, machine.document)
     return 0 if all(check.state != "missing" for check in checks) else 5
 
 
 @app.command()
 def demo(
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the result.")] = Path(
-        "meshreg_demo"
-    ),
+    out: OutOption = Path("meshreg_demo"),
     real: Annotated[
         bool, typer.Option("--real", help="Two drone surveys of a beach instead of a made reef.")
     ] = False,
@@ -381,16 +329,15 @@ def demo(
     """Make two surveys of a reef, do the main job on them, and compare with the truth."""
     del debug
     from meshreg.cli_parts import demonstrating
-    from meshreg.cli_parts.guard import run_stoppable
 
-    voice = _voice(as_json)
-    demonstrating.introduce(real, voice)
+    demonstrating.introduce(real, _voice(as_json))
     job = demonstrating.real if real else demonstrating.made
-    done = run_stoppable(lambda unfinished: job(out, overwrite, voice, unfinished))
-    if as_json:
-        voice.document(demonstrating.document(done))
-    else:
-        demonstrating.show(done, out, voice)
+    done = _done(
+        as_json,
+        lambda voice, unfinished: job(out, overwrite, voice, unfinished),
+        lambda done, voice: demonstrating.show(done, out, voice),
+        demonstrating.document,
+    )
     return 0 if done.registration.verdict == "accepted" else 4
 
 
@@ -412,28 +359,22 @@ def synth(
     """Make a pair of surveys of a seafloor that is known, with the truth beside them."""
     del debug
     from meshreg.cli_parts import making
-    from meshreg.cli_parts.guard import run_stoppable
 
-    voice = _voice(as_json)
     request = making.SynthRequest(
         scenario, out, kind, seed, size, making.parse_changes(changes), overwrite
     )
-    document = run_stoppable(lambda unfinished: making.synth(request, voice))
-    if as_json:
-        voice.document(document)
-    else:
-        making.show(document, voice)
+    _done(as_json, lambda voice, unfinished: making.synth(request, voice), making.show)
     return 0
 
 
 @app.command()
 def selftest(
-    reference: Annotated[str, typer.Argument(help="Original survey: file, folder or quoted glob.")],
+    reference: ReferenceArgument,
     moving: Annotated[str, typer.Argument(help="Repeat survey, into which shifts are put.")],
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder for the result.")] = None,
+    out: MaybeOutOption = None,
     count: Annotated[int, typer.Option("--shifts", help="How many shifts.")] = 8,
-    reference_shift: Annotated[str | None, typer.Option(metavar="E,N,U", help=_SHIFT)] = None,
-    moving_shift: Annotated[str | None, typer.Option(metavar="E,N,U", help=_SHIFT)] = None,
+    reference_shift: ShiftOption = None,
+    moving_shift: ShiftOption = None,
     axes: AxesOption = None,
     up: UpOption = None,
     unit: UnitOption = None,
@@ -441,8 +382,9 @@ def selftest(
     config: ConfigOption = None,
     changes: SetOption = None,
     seed: Annotated[int | None, typer.Option(help="Seed of the shifts; 0.")] = None,
-    scale: ScaleOption = None,
-    positions: PositionsOption = None,
+    scale: ScalesOption = None,
+    positions: PositionsListOption = None,
+    geometry_only: GeometryOnlyOption = False,
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
     debug: DebugOption = False,
@@ -453,33 +395,31 @@ def selftest(
     """
     del debug
     from meshreg.cli_parts import selftesting
-    from meshreg.cli_parts.common import SurveyRequest
-    from meshreg.cli_parts.guard import run_stoppable
 
     settings = join_settings(None, config, changes, {"seed": seed})
-    scales, places = for_both("--scale", scale), for_both("--positions", positions)
-    shared = {"axes": axes, "up": up, "unit": unit}
-    options = [
-        read_options(shift, name, **shared, scale=scales[k], positions=places[k])
-        for k, (shift, name) in enumerate(
-            ((reference_shift, "--reference-shift"), (moving_shift, "--moving-shift"))
-        )
-    ]
+    surveys = survey_requests(
+        (reference, moving),
+        (reference_shift, moving_shift),
+        scale,
+        positions,
+        axes=axes,
+        up=up,
+        unit=unit,
+        geometry_only=geometry_only,
+    )
     request = selftesting.SelftestRequest(
-        SurveyRequest(reference, options[0]),
-        SurveyRequest(moving, options[1]),
+        *surveys,
         out,
         tuple(mask or ()),
         settings,
         count,
         overwrite,
     )
-    voice = _voice(as_json)
-    document = run_stoppable(lambda unfinished: selftesting.selftest(request, voice, unfinished))
-    if as_json:
-        voice.document(document)
-    else:
-        selftesting.show(document, voice)
+    document = _done(
+        as_json,
+        lambda voice, unfinished: selftesting.selftest(request, voice, unfinished),
+        selftesting.show,
+    )
     return 0 if document["verdict"] == "accepted" else 4
 
 
@@ -506,23 +446,20 @@ def benchmark(
     """Repeat the paper's experiment on pairs with known truth. Exit code 4: not as expected."""
     del debug
     from meshreg.cli_parts import benchmarking
-    from meshreg.cli_parts.guard import StoppedError, run_stoppable
+    from meshreg.cli_parts.guard import StoppedError
 
     request = benchmarking.BenchmarkRequest(
         out, scenarios, repeats, elsewhere, size, seed, workers, resume, overwrite
     )
-    voice = _voice(as_json)
     try:
-        summary = run_stoppable(
-            lambda unfinished: benchmarking.benchmark(request, voice, unfinished)
+        summary = _done(
+            as_json,
+            lambda voice, unfinished: benchmarking.benchmark(request, voice, unfinished),
+            lambda summary, voice: benchmarking.show(summary, out, voice),
         )
     except StoppedError as stopped:
         stopped.add_note("what is done is kept, --resume goes on.")
         raise
-    if as_json:
-        voice.document(summary)
-    else:
-        benchmarking.show(summary, out, voice)
     return 4 if summary["unmet"] else 0
 
 
@@ -536,13 +473,13 @@ def pick(
     registration: Annotated[
         Path | None, typer.Option(metavar="OUT", help="Pan together by a registration.")
     ] = None,
-    reference_shift: Annotated[str | None, typer.Option(metavar="E,N,U", help=_SHIFT)] = None,
-    moving_shift: Annotated[str | None, typer.Option(metavar="E,N,U", help=_SHIFT)] = None,
+    reference_shift: ShiftOption = None,
+    moving_shift: ShiftOption = None,
     axes: AxesOption = None,
     up: UpOption = None,
     unit: UnitOption = None,
-    scale: ScaleOption = None,
-    positions: PositionsOption = None,
+    scale: ScalesOption = None,
+    positions: PositionsListOption = None,
     cell: Annotated[float | None, typer.Option(help="Cell of the pictures; from the data.")] = None,
     port: Annotated[int, typer.Option(min=0, max=65535, help="0 takes a free one.")] = 0,
     browser: Annotated[bool, typer.Option("--browser", help="Open the page there.")] = False,
@@ -556,24 +493,18 @@ def pick(
     """
     del debug
     from meshreg.cli_parts import picking
-    from meshreg.cli_parts.common import SurveyRequest
 
     if moving is None and registration is not None:
         raise UsageError("--registration goes with two surveys; a folder has its own.")
-    scales, places = for_both("--scale", scale), for_both("--positions", positions)
-    shared = {"axes": axes, "up": up, "unit": unit}
-    surveys = [
-        SurveyRequest(
-            path,
-            read_options(shift, name, **shared, scale=scales[k], positions=places[k]),
-        )
-        for k, (path, shift, name) in enumerate(
-            (
-                (reference, reference_shift, "--reference-shift"),
-                (moving or "", moving_shift, "--moving-shift"),
-            )
-        )
-    ]
+    surveys = survey_requests(
+        (reference, moving or ""),
+        (reference_shift, moving_shift),
+        scale,
+        positions,
+        axes=axes,
+        up=up,
+        unit=unit,
+    )
     request = picking.PickRequest(
         surveys[0], surveys[1] if moving else None, ties, registration, cell, port, browser
     )
@@ -605,16 +536,32 @@ def validate(
     """
     del debug
     from meshreg.cli_parts import validating
+
+    request = validating.ValidateRequest(out, ties, reference_ortho, moving_ortho, radius, seed)
+    document = _done(
+        as_json,
+        lambda voice, unfinished: validating.validate(request),
+        lambda document, voice: validating.show(document, out, voice),
+    )
+    return 0 if document["confirmed"] else 4
+
+
+def _done(
+    as_json: bool,
+    job: Callable[[Voice, Unfinished], Result],
+    show: Callable[[Result, Voice], None],
+    document: Callable[[Result], Any] | None = None,
+) -> Result:
+    """Do a job, then print what came of it: for people, or as one JSON document."""
     from meshreg.cli_parts.guard import run_stoppable
 
     voice = _voice(as_json)
-    request = validating.ValidateRequest(out, ties, reference_ortho, moving_ortho, radius, seed)
-    document = run_stoppable(lambda unfinished: validating.validate(request))
+    result = run_stoppable(lambda unfinished: job(voice, unfinished))
     if as_json:
-        voice.document(document)
+        voice.document(result if document is None else document(result))
     else:
-        validating.show(document, out, voice)
-    return 0 if document["confirmed"] else 4
+        show(result, voice)
+    return result
 
 
 def _voice(as_json: bool) -> Voice:

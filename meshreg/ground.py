@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from meshreg.types import Float64
+from meshreg.types import Bool, Float64
 
 Index = NDArray[np.int_]
 MAD_TO_SIGMA = 1.4826
@@ -19,8 +19,10 @@ BLOCK_CUT = 4.0  # robust deviations at which a block is not believed
 ROUNDING = 1e-9  # m
 
 
-def block_grounds(difference: Float64, number: Index, count: int) -> tuple[Float64, Index, Float64]:
-    """Each block's ground [m], its cells, and the share of them that lies on that ground."""
+def block_grounds(
+    difference: Float64, number: Index, count: int
+) -> tuple[Float64, Index, Float64, Bool]:
+    """Each block's ground [m], its cells, the share of them on that ground, and whether each is."""
     cells = np.bincount(number, minlength=count)
     order = np.lexsort((difference, number))
     first = np.concatenate([[0], np.cumsum(cells)[:-1]])
@@ -35,7 +37,9 @@ def block_grounds(difference: Float64, number: Index, count: int) -> tuple[Float
         near = away <= CUT * sigma[:, None] + ROUNDING
         held = np.maximum(near.sum(axis=1), 1)
         ground = np.where(near, values, 0.0).sum(axis=1) / held
-    return ground, cells, near.sum(axis=1) / np.maximum(cells, 1)
+    member = np.empty(len(order), bool)
+    member[order] = near[number[order], place]
+    return ground, cells, near.sum(axis=1) / np.maximum(cells, 1), member
 
 
 def shortest_half(values: Float64, cells: Index) -> tuple[Float64, Float64]:

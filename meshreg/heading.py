@@ -12,11 +12,10 @@ from meshreg.refine import Refined
 from meshreg.settings import SearchSettings
 from meshreg.tiles import MAX_YAW
 from meshreg.types import Float64, SurveyRaster, Transform
-from meshreg.voting import SMALL_YAW, Turn, similarity, vote
+from meshreg.voting import SMALL_YAW, Turn, vote
 
 Pairs = dict[str, tuple[SurveyRaster, SurveyRaster]]
 Turned = Callable[[Turn], tuple[Pairs, Transform]]
-LEAST_TILES = 12  # for a scale of their own
 
 
 def turning(turn: Turn, centre: Float64) -> Transform:
@@ -84,15 +83,6 @@ def _missized(scale: float) -> str:
     return f"{100 * abs(1 / scale - 1):.1f} % too {'small' if scale > 1 else 'large'}"
 
 
-def tile_scale(refined: Refined) -> float:
-    """Return the scale that the refined tiles speak for; 1 where they are too few."""
-    tiles = refined.tiles
-    if tiles is None or len(tiles.places) < LEAST_TILES:
-        return 1.0
-    found = similarity(tiles.places - refined.pivot, tiles.offsets, 1e-4)
-    return 1.0 if found is None else found[2]
-
-
 def as_delivered(refined: Refined, motion: Transform) -> Refined:
     """Put the answer for the turned survey and the turn together: one from the delivered one."""
 
@@ -111,5 +101,4 @@ def as_delivered(refined: Refined, motion: Transform) -> Refined:
         offset=refined.pivot + refined.offset - pivot,
         yaw=refined.yaw + float(np.arctan2(motion.rotation[1, 0], motion.rotation[0, 0])),
         tiles=tiles,
-        field=None,
     )

@@ -23,10 +23,13 @@ from meshreg.ground import (
     numbered,
     slow_bending,
 )
-from meshreg.types import Bool, Float64, SurveyRaster, Transform
+from meshreg.types import Bool, Float64, Grid, SurveyRaster, Transform, UInt8, Warp
 
 MAX_TILT = np.deg2rad(3.0)
 MIN_BLOCKS = 12
+# What a cell of ground was for the height and the tilt: not compared; changed against the ground
+# around it; in a block that changed as a whole, which is told by its neighbours; counted.
+UNKNOWN, CHANGED, SET_ASIDE, STABLE = range(4)
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +52,9 @@ class Heights:
         Robust deviation of the blocks from their neighbours' median [m].
     note, doubt : str
         What the user should know; why the answer cannot be accepted.
+    ground : (H, W) uint8 or None
+        What each cell of the moving DEM was: UNKNOWN, CHANGED, SET_ASIDE or STABLE. A stable cell
+        has a weight of one, the others of nought; None where there was too little ground to tell.
     """
 
     place: Float64
@@ -59,6 +65,7 @@ class Heights:
     sigma: float = float("nan")
     note: str = ""
     doubt: str = ""
+    ground: UInt8 | None = None
 
     def transform(self, horizontal: Transform) -> Transform:
         """Complete a horizontal registration: lifted by `up` and tilted about `place`."""
@@ -193,6 +200,30 @@ class _Plane:
     choice: float  # change of up if nothing is left out [m]
     kept: float
     sigma: float
+    ground: UInt8  # (H, W) of the moving DEM
+
+
+def stable_ground(
+    ground: UInt8,
+    grid: Grid,
+    transform: Transform,
+    moved: SurveyRaster,
+    warp: Warp | None = None,
+) -> UInt8:
+    """(h, w) uint8: `Heights.ground`, on the `grid` of the moving DEM as delivered, laid down.
+
+    Each cell of the `moved` DEM takes what the nearest cell was from which it came.
+    """
+    row, col = np.nonzero(moved.valid)
+    points = _points(moved, row, col)
+    if warp is not None:  # its displacement changes by millimetres over itself: no inverse needed
+        points = points - warp.displacement(points)
+    points = transform.inverse().apply(points)
+    there = np.rint(np.stack(grid.row_col(points[:, 0], points[:, 1]))).astype(int)
+    inside = ((there >= 0) & (there < np.array(grid.shape)[:, None])).all(axis=0)
+    laid = np.zeros(moved.grid.shape, np.uint8)
+    laid[row[inside], col[inside]] = ground[tuple(there[:, inside])]
+    return laid
 
 
 def _points(raster: SurveyRaster, row: Index, col: Index) -> Float64:
@@ -228,7 +259,8 @@ def _settled(
         tilt = answer.tilt + plane.step[1:]
         if np.hypot(*tilt) > 4 * MAX_TILT:  # no ground at all; do not turn it upside down
             return replace(answer, tilt=tilt), plane
-        answer = replace(answer, up=answer.up + float(plane.step[0]), tilt=tilt)
+        up = answer.up + float(plane.step[0])
+        answer = replace(answer, up=up, tilt=tilt, ground=plane.ground)
         if abs(plane.step[0]) < 1e-5 and np.abs(plane.step[1:]).max() < 1e-6:
             break
     return answer, plane
@@ -243,7 +275,7 @@ def _plane(
     span = min(np.ptp(row), np.ptp(col)) + 1
     side = int(np.clip(span // 20, 8, 16))
     block, number = numbered(row // side, col // side)
-    ground, cells, kept = block_grounds(difference, number, block.shape[0])
+    ground, cells, kept, held = block_grounds(difference, number, block.shape[0])
     known = cells >= 0.25 * side**2
     if known.sum() < MIN_BLOCKS:
         return None
@@ -265,6 +297,10 @@ def _plane(
     value = np.where(wild, bent + around, value)
     step = least_squares(design, weight, value) if tilted else np.zeros(3)
     step[0] = np.average(value, weights=weight)
+    believed = np.full(len(cells), UNKNOWN, np.uint8)
+    believed[known] = np.where(wild, SET_ASIDE, STABLE)
+    state = np.zeros(moving.grid.shape, np.uint8)
+    state[row, col] = np.where((believed[number] == STABLE) & ~held, CHANGED, believed[number])
     flat = difference - step[0]
     if tilted:
         flat = flat - step[1] * (points[:, 1] - centre[1]) + step[2] * (points[:, 0] - centre[0])
@@ -278,6 +314,7 @@ def _plane(
         float(np.median(flat)),
         float((kept[known] * weight)[~wild].sum() / weight.sum()),
         sigma,
+        state,
     )
 
 

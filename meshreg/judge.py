@@ -223,9 +223,11 @@ def channel_map(
         return window, surface, counts, find_peak(surface, window.east, window.north, exclusion)
 
     seen = look(second)
-    if seen is None or seen[3] is None:
+    if seen is None:
         return None
     window, surface, counts, peak = seen
+    if peak is None:
+        return None
     turned: dict[str, float] = {}
     for turn, flip in TURNS:
         null = look(second.turned(turn, flip), turn)
@@ -261,7 +263,8 @@ def _candidates(
     ]
     for name, channel in maps.items():
         assert channel.peak is not None
-        found.append((channel.peak.east, channel.peak.north, channel.peak.sigma, f"{name} channel"))
+        # how sharp a peak is does not tell how far warp has moved it: no sigma of its own
+        found.append((channel.peak.east, channel.peak.north, None, f"{name} channel"))
         if channel.peak.second is not None:
             found.append((*channel.peak.second, None, f"{name} channel's second"))
     return found

@@ -40,12 +40,11 @@ class Motion:
     Attributes
     ----------
     answer : (k,) float64
-        East and north [m] at the pivot; the turn [rad] too where it was sought.
+        East and north [m] at the pivot; where they were sought the turn [rad], and the stretch:
+        exactly ``s sin psi`` and ``s cos psi - 1`` of a similarity.
     covariance : (k, k) float64
     used : (M,) bool
         False where a tile lies far from what its neighbours say.
-    noise, warp : float
-        Deviation [m] per axis of a tile's error, and of the internal warp.
     field : Field
         The warp itself.
     """
@@ -53,8 +52,6 @@ class Motion:
     answer: Float64
     covariance: Float64
     used: Bool
-    noise: float
-    warp: float
     field: Field
 
 
@@ -70,7 +67,7 @@ class Field:
 
     def __call__(self, places: Float64) -> Float64:
         """Offset (N, 2) [m] at places (N, 2)."""
-        rigid = design(places, self.pivot, yaw_free=len(self.answer) == 3) @ self.answer
+        rigid = design(places, self.pivot, len(self.answer)) @ self.answer
         return np.asarray(rigid + correlation(places, self.places, self.reach) @ self.weights)
 
     def growth(self, places: Float64) -> Float64:
@@ -87,6 +84,7 @@ def best_motion(
     pivot: Float64,
     *,
     yaw_free: bool,
+    scale_free: bool = False,
     start: Motion | None = None,
 ) -> Motion:
     """Find the rigid motion that fits all of the ground best; leave out tiles that stand alone.
@@ -100,28 +98,31 @@ def best_motion(
         Where the offset is stated [m].
     yaw_free : bool
         Whether a turn is sought too.
+    scale_free : bool
+        Whether a turn and a stretch are sought too.
     start : Motion, optional
         Whose tiles are used as they are.
     """
+    terms = 4 if scale_free else 2 + yaw_free
     if start is not None:
-        return _krige(places, offsets, start.used, ground, pivot, yaw_free=yaw_free)[0]
+        return _krige(places, offsets, start.used, ground, pivot, terms)[0]
     used = _near_neighbours(places, offsets)
     for _ in range(5):
         before = used
-        motion, used = _krige(places, offsets, used, ground, pivot, yaw_free=yaw_free)
+        motion, used = _krige(places, offsets, used, ground, pivot, terms)
         if (used == before).all():
             break
     return motion
 
 
-def design(places: Float64, pivot: Float64, *, yaw_free: bool) -> Float64:
-    """(M, 2, k) float64: what each parameter does to the offset at each place."""
+def design(places: Float64, pivot: Float64, terms: int) -> Float64:
+    """(M, 2, k) float64: what each of the 2 to 4 parameters does to the offset at each place."""
     arm = places - pivot
-    columns = np.zeros((len(arm), 2, 3 if yaw_free else 2))
+    columns = np.zeros((len(arm), 2, 4))
     columns[:, 0, 0] = columns[:, 1, 1] = 1.0
-    if yaw_free:
-        columns[:, 0, 2], columns[:, 1, 2] = -arm[:, 1], arm[:, 0]
-    return columns
+    columns[:, 0, 2], columns[:, 1, 2] = -arm[:, 1], arm[:, 0]
+    columns[:, :, 3] = arm
+    return columns[:, :, :terms]
 
 
 def correlation(first: Float64, second: Float64, reach: float) -> Float64:
@@ -168,12 +169,11 @@ def _krige(
     used: Bool,
     ground: Ground,
     pivot: Float64,
-    *,
-    yaw_free: bool,
+    terms: int,
 ) -> tuple[Motion, Bool]:
     """Average over all likely reaches and shares of the warp; also tell which tiles fit."""
     here, there = places[used], offsets[used]
-    drift = design(here, pivot, yaw_free=yaw_free)
+    drift = design(here, pivot, terms)
     diagonal = float(np.hypot(*np.ptp(places, axis=0)))
     thin = slice(None, None, -(-len(here) // MOST_TILES))
     tries = []
@@ -195,18 +195,16 @@ def _krige(
     answer = sum(weight * a for weight, _, a, _ in found) / total
     covariance = sum(w * (c + np.outer(a - answer, a - answer)) for w, _, a, c in found) / total
     best = max(found, key=lambda entry: entry[0])[1]
-    noise, warp = (np.sqrt(best.variance * part) for part in (1 - best.share, best.share))
     weights = best.share * best.inverse @ best.left
     field = Field(here, pivot, best.answer, weights, best.reach)
-    motion = Motion(answer, covariance, used, float(noise), float(warp), field)
-    return motion, _fitting(best, places, offsets, used, pivot)
+    return Motion(answer, covariance, used, field), _fitting(best, places, offsets, used, pivot)
 
 
 def _over_ground(
     fit: _Fit, places: Float64, drift: Float64, ground: Ground, pivot: Float64
 ) -> tuple[Float64, Float64]:
     """Best motion over the ground, drift and warp together, and its covariance."""
-    over = design(ground.places, pivot, yaw_free=drift.shape[2] == 3)
+    over = design(ground.places, pivot, drift.shape[2])
     area = ground.share[:, None, None]
     normal = np.einsum("gik,gil->kl", over, area * over)
     # (2, k, G): what a field at each place, along each axis, does to the answer
@@ -227,8 +225,7 @@ def _over_ground(
 def _fitting(fit: _Fit, places: Float64, offsets: Float64, used: Bool, pivot: Float64) -> Bool:
     """Tell which tiles lie where all the others, drift and warp, expect them."""
     here = places[used]
-    yaw_free = len(fit.answer) == 3
-    drift = design(here, pivot, yaw_free=yaw_free)
+    drift = design(here, pivot, len(fit.answer))
     weighed = np.tensordot(fit.inverse, drift, 1)
     # leave-one-out (Dubrule, Mathematical Geology 15, 1983): (P d)_m / P_mm, of variance s²/P_mm
     inner = np.diag(fit.inverse)[:, None] - np.einsum(
@@ -243,7 +240,7 @@ def _fitting(fit: _Fit, places: Float64, offsets: Float64, used: Bool, pivot: Fl
     out = ~used
     if out.any():
         near = fit.share * correlation(places[out], here, fit.reach)
-        expected = design(places[out], pivot, yaw_free=yaw_free) @ fit.answer
+        expected = design(places[out], pivot, len(fit.answer)) @ fit.answer
         expected += near @ alone
         variance = 1.0 - ((near @ fit.inverse) * near).sum(axis=1)
         away = ((offsets[out] - expected) ** 2).sum(axis=1)

@@ -2,7 +2,8 @@
 
 Each model is fitted to offsets that were measured tile by tile (`meshreg.warp`), robustly and with
 each tile predicted from the others. A richer model is taken only where it predicts tiles that it
-has not seen clearly better, and strains the survey by less than a survey can be strained.
+has not seen clearly better, on all of the ground and on that which needed no bend, folds nothing,
+and strains the survey as a whole (`strain`) by less than a survey can be strained.
 
 All models are kept as bicubic B-splines on one box; the polynomials are contained in them exactly.
 """
@@ -14,16 +15,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from meshreg.types import Float64, Warp, cubic_weights
+from meshreg.held_out import RAYLEIGH, groups_of, robust, steadiest
+from meshreg.types import Bool, Float64, Warp, cubic_weights
 
 MODELS = ("rigid", "similarity", "dome", "quadratic", "spline")
 FALL = 0.9  # a richer model must bring the held-out error below this share
+TRUSTED = 0.5  # weight from which on a tile agrees with a model
+FOLDS = 0.5  # slope of the displacement: steeper ground than this is no survey's bend
 FINEST = 1 / 2000  # of a tile's side: a bend smaller than this is nobody's error
 KNOT_TILES, KNOT_METRES = 2.0, 8.0  # knots closer than this would follow corals, not cameras
 MOST_INTERVALS = 8  # a side
 MIN_TILES = {"rigid": 6, "similarity": 8, "dome": 8, "quadratic": 12, "spline": 16}
 _BENDING = np.logspace(-4, 1, 11)  # weights of the bending energy that are tried
-_RAYLEIGH = {1: 0.6745, 2: 1.1774}  # median length of a normal deviate in 1 and 2 dimensions
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +60,7 @@ class Step:
     weights : (M,) float64
         0 (set aside) to 1.
     strain : float
-        Largest strain in the box, the rigid part apart.
+        Of the survey as a whole (`strain`).
     """
 
     model: str
@@ -74,7 +77,9 @@ def climb(sample: Sample) -> tuple[Step, ...]:
         enough = len(np.unique(sample.block)) >= MIN_TILES[model]
         if not enough or (model == "similarity" and sample.values.shape[1] == 1):
             continue
-        steps += list(_fits(sample, model))
+        fits = _fits(sample, model)
+        # a fit that folds the ground could not be undone; it follows a few wrong tiles in a corner
+        steps += [s for s in fits if steepest(_alone(s.coefficients, sample)) < FOLDS]
     return tuple(steps)
 
 
@@ -83,20 +88,42 @@ def choose(steps: Sequence[Step], sample: Sample, max_strain: float) -> Step:
 
     Of few tiles a tenth may be chance: the fall must also be larger than two of its standard
     errors, and than three where it is the first departure from a rigid move.
+
+    It must fall on all of the ground, and on that alone which agrees with the poorer model. A bend
+    of the cameras strains all of the ground, and what predicts it predicts all of it better.
+    Ground that has changed in one piece leaves the rest where a rigid move had it already, and a
+    bend that follows it helps no other tile. That tells them apart until half of the ground has
+    changed. It does not where the models bend and ground slides too: a piece as wide as two knots
+    are apart looks like the bend that it lies in.
     """
     costs = _costs(steps, sample)
-    errors = np.sqrt(costs.mean(axis=1))
     best = 0
     for model in MODELS[1:]:
         able = [k for k, s in enumerate(steps) if s.model == model and s.strain <= max_strain]
         if not able:
             continue
-        rival = min(able, key=lambda k: errors[k])
-        gain = costs[best] - costs[rival]
-        doubt = (2.0 if best else 3.0) * gain.std() / np.sqrt(gain.size)
-        if errors[rival] <= FALL * errors[best] and gain.mean() > doubt:
+        rival = min(able, key=lambda k: float(costs[k].mean()))
+        poor, rich = costs[best], costs[rival]
+        agreeing = _blocks(steps[best].weights > TRUSTED, sample)
+        # whether there is any bend is asked of the agreeing ground with the same rigour
+        if _falls(poor, rich, 2.0 if best else 3.0) and _falls(
+            poor[agreeing], rich[agreeing], 0.0 if best else 3.0
+        ):
             best = rival
     return steps[best]
+
+
+def _blocks(tiles: Bool, sample: Sample) -> Bool:
+    """(B,): whether any of a block's tiles is among `tiles` (M,)."""
+    groups = groups_of(sample.block)
+    return np.asarray((tiles[groups] & (groups >= 0)).any(axis=1))
+
+
+def _falls(poor: Float64, rich: Float64, sigmas: float) -> bool:
+    """Whether the error falls by a tenth from costs `poor` to `rich` (B,), and for sure."""
+    gain = poor - rich
+    doubt = sigmas * gain.std() / np.sqrt(gain.size)
+    return bool(rich.mean() <= FALL**2 * poor.mean() and gain.mean() > doubt)
 
 
 def _costs(steps: Sequence[Step], sample: Sample) -> Float64:
@@ -112,9 +139,9 @@ def _costs(steps: Sequence[Step], sample: Sample) -> Float64:
         members = sample.channel == channel
         held = np.hypot([step.held[members] for step in steps], finest)
         middle = float(np.median(held, axis=1).min())
-        scale = middle / _RAYLEIGH[sample.values.shape[1]]
+        scale = middle / RAYLEIGH[sample.values.shape[1]]
         costs[:, members] = np.minimum(held / scale, 3.0) ** 2
-    groups = _groups(sample.block)
+    groups = groups_of(sample.block)
     there = groups >= 0
     return np.asarray((costs[:, groups] * there).sum(axis=2) / there.sum(axis=1))
 
@@ -126,7 +153,8 @@ def _fits(sample: Sample, model: str) -> Iterator[Step]:
         return
     sites = _sites(sample, counts or (1, 1))
     design, at_sites = (_polynomials(p, sample, model) for p in (sample.places, sites))
-    answer, held, weights = _robust(design, sample, None)
+    start = steadiest(design, sample.values) if model == "rigid" else None
+    answer, held, weights = robust(design, sample.values, sample.block, sample.channel, start=start)
     table = _through(at_sites @ answer, sites, sample, counts or (1, 1))
     yield _step(model, table, held, weights, sample)
 
@@ -140,7 +168,9 @@ def _splines(sample: Sample, counts: tuple[int, int]) -> Iterator[Step]:
     energy = np.kron(_bending_energy(sample, counts), eye)
     energy *= np.trace(basis.T @ basis) / np.trace(energy) * dimension
     for stiffness in _BENDING:
-        answer, held, weights = _robust(design, sample, stiffness * energy)
+        answer, held, weights = robust(
+            design, sample.values, sample.block, sample.channel, stiffness * energy
+        )
         table = answer.reshape(counts[1] + 3, counts[0] + 3, dimension)
         yield _step("spline", table, held, weights, sample)
 
@@ -155,120 +185,50 @@ def intervals(sample: Sample) -> tuple[int, int] | None:
 
 
 def _step(model: str, table: Float64, held: Float64, weights: Float64, sample: Sample) -> Step:
+    weights = weights / max(weights.max(), 1e-300)
+    return Step(model, table, held, weights, strain(_alone(table, sample)))
+
+
+def _alone(table: Float64, sample: Sample) -> Warp:
+    """Coefficients (R, C, K) as a warp that does nothing else."""
     whole = np.zeros((*table.shape[:2], 3))
-    if table.shape[2] == 2:
-        whole[..., :2] = table
-    else:
-        whole[..., 2:] = table
-    strain = largest_strain(Warp(model, model, sample.low, sample.high, whole))
-    return Step(model, table, held, weights / max(weights.max(), 1e-300), strain)
+    whole[..., slice(0, 2) if table.shape[2] == 2 else slice(2, 3)] = table
+    return Warp("", "", sample.low, sample.high, whole)
 
 
-def largest_strain(warp: Warp) -> float:
-    """Largest principal strain in the warp's box: horizontal, or the shear by a change of slope.
+def strain(warp: Warp) -> float:
+    """How much a warp strains a survey as a whole.
 
-    Strain is the symmetric part of the gradient; a mean tilt is rigid, and left out.
+    Root mean square, over all lines in the box that are at least half of its diagonal long, of
+    their change in length, as a share of it; of a vertical bend, half the angle by which they
+    tilt (a shear), their mean tilt apart. The larger of the two. To first order no rigid motion
+    strains, and a similarity strains by its scale.
+
+    A strain has no meaning without the length that it is taken over. Over short lengths it does
+    not tell cameras' bends from anything else: a bend of u rms on a square of side L strains it by
+    ``sqrt(6) u / L`` rms as a uniform stretch, 1 % for 10 cm on 25 m, by twice that in waves about
+    as long as the square, and by four times at the steepest. Over the lengths that scale bars and
+    camera networks hold, the same bend is 0.7 %.
     """
-    axes = (np.linspace(a, b, 25) for a, b in zip(warp.low, warp.high, strict=True))
+    axes = (np.linspace(low, high, 9) for low, high in zip(warp.low, warp.high, strict=True))
     places = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
-    slopes = warp.gradient(places)
-    a, b = slopes[:, 0, 0], slopes[:, 1, 1]
-    shear = 0.5 * (slopes[:, 0, 1] + slopes[:, 1, 0])
-    flat = np.abs(a + b) / 2 + np.hypot((a - b) / 2, shear)
-    bend = 0.5 * np.hypot(*(slopes[:, 2] - slopes[:, 2].mean(axis=0)).T)
-    return float(max(flat.max(), bend.max()))
+    moved = warp.displacement(places)
+    arm = places - places.mean(axis=0)
+    up = moved[:, 2] - arm @ np.linalg.lstsq(arm, moved[:, 2], rcond=None)[0]
+    first, second = np.triu_indices(len(places), 1)
+    line = places[second] - places[first]
+    square = (line**2).sum(axis=1)
+    far = square >= 0.25 * ((warp.high - warp.low) ** 2).sum()
+    along = ((moved[second] - moved[first])[:, :2] * line).sum(axis=1) / square
+    tilt = 0.5 * (up[second] - up[first]) / np.sqrt(square)
+    return float(max(np.sqrt(np.mean(part[far] ** 2)) for part in (along, tilt)))
 
 
-# ---- the robust fit ---------------------------------------------------------------------------
-
-
-def _robust(
-    design: Float64, sample: Sample, penalty: Float64 | None, iterations: int = 20
-) -> tuple[Float64, Float64, Float64]:
-    """Answer (p,), held-out lengths (M,) and weights (M,) of a fit of `design` (M, K, p).
-
-    Weights come from held-out residuals, so that a bending model cannot run after a tile that lies
-    wrong and then find it fitting; in proportion to how well the other tiles can predict that
-    tile, so that no corner is set aside for being one. Huber's at first, whose answer has one
-    minimum, then Tukey's biweight at four deviations, which sets changed ground aside.
-    """
-    groups = _groups(sample.block)
-    scale = _scale(np.linalg.norm(sample.values - np.median(sample.values, axis=0), axis=1), sample)
-    weights = np.ones(len(design))
-    answer = np.zeros(design.shape[2])
-    for turn in range(iterations):
-        weighted = design * (weights / scale**2)[:, None, None]
-        normal = np.tensordot(weighted, design, axes=((0, 1), (0, 1)))
-        if penalty is not None:
-            normal = normal + penalty * np.mean(weights / scale**2)
-        # a floor far under any rounding keeps ground without tiles at rest
-        normal[np.diag_indices_from(normal)] += 1e-12 * np.trace(normal) / len(normal)
-        inverse = np.asarray(np.linalg.inv(normal), np.float64)
-        pull = np.tensordot(weighted, sample.values, axes=((0, 1), (0, 1)))
-        before, answer = answer, inverse @ pull
-        residual = sample.values - design @ answer
-        held, doubt = _held_out(design, weighted, inverse, residual, groups)
-        size = np.linalg.norm(held, axis=1) / np.sqrt(1 + doubt / scale**2)
-        scale = _scale(size, sample)
-        weights = _weights(size / scale, huber=turn < 4)
-        if turn > 5 and np.abs(design @ (answer - before)).max() < 1e-5:
-            break
-    return answer, np.linalg.norm(held, axis=1), weights
-
-
-def _weights(size: Float64, *, huber: bool) -> Float64:
-    if huber:
-        return np.asarray(np.minimum(1.0, 1.5 / np.maximum(size, 1e-12)))
-    return np.asarray(np.clip(1 - (size / 4.0) ** 2, 0, None) ** 2)
-
-
-def _scale(size: Float64, sample: Sample) -> Float64:
-    """Robust deviation per axis [m] of each tile's channel; nothing is known to a micrometre."""
-    scale = np.empty(len(size))
-    for channel in np.unique(sample.channel):
-        members = sample.channel == channel
-        middle = float(np.median(size[members])) / _RAYLEIGH[sample.values.shape[1]]
-        scale[members] = max(middle, 1e-6)
-    return scale
-
-
-def _groups(block: np.ndarray) -> np.ndarray:
-    """(B, n) indices of each block's tiles, -1 where a block has fewer than the largest."""
-    _, number = np.unique(block, return_inverse=True)
-    counts = np.bincount(number)
-    order = np.argsort(number, kind="stable")
-    groups = np.full((len(counts), counts.max()), -1)
-    column = np.arange(len(block)) - np.repeat(np.cumsum(counts) - counts, counts)
-    groups[number[order], column] = order
-    return groups
-
-
-def _held_out(
-    design: Float64, weighted: Float64, inverse: Float64, residual: Float64, groups: np.ndarray
-) -> tuple[Float64, Float64]:
-    """Residuals (M, K) of each tile from the fit without its block, and that fit's doubt (M,).
-
-    For weights that stay, no new fit is needed: ``r_b(-b) = (1 - H)⁻¹ r_b`` with
-    ``H = X A⁻¹ X' W``, and the variance of the prediction is ``(1 - H)⁻¹ X A⁻¹ X'``; X are the
-    block's rows, A the normal matrix. The doubt [m²] is the mean over the axes.
-    """
-    blocks, most = groups.shape
-    there = (groups >= 0)[..., None]
-    dimension, count = design.shape[1:]
-    size = most * dimension
-    own = (design[groups] * there[..., None]).reshape(blocks, size, count)
-    pull = (weighted[groups] * there[..., None]).reshape(blocks, size, count)
-    spread = own @ inverse
-    hat = spread @ np.swapaxes(pull, 1, 2)
-    left = (residual[groups] * there).reshape(blocks, size, 1)
-    # a tile that alone holds a coefficient is predicted by nothing: its residual grows large
-    both = np.concatenate([left, spread @ np.swapaxes(own, 1, 2)], axis=2)
-    solved = np.linalg.solve(np.eye(size) * (1 + 1e-9) - hat, both)
-    doubt = np.diagonal(solved[:, :, 1:], axis1=1, axis2=2).reshape(blocks, most, dimension)
-    held, doubts = np.empty_like(residual), np.empty(len(residual))
-    held[groups[groups >= 0]] = solved[:, :, 0].reshape(blocks, most, dimension)[groups >= 0]
-    doubts[groups[groups >= 0]] = np.maximum(doubt.mean(axis=2), 0.0)[groups >= 0]
-    return held, doubts
+def steepest(warp: Warp) -> float:
+    """Largest slope of the horizontal displacement in the box: from 1 on the ground may fold."""
+    axes = (np.linspace(low, high, 25) for low, high in zip(warp.low, warp.high, strict=True))
+    places = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
+    return float(np.linalg.norm(warp.gradient(places)[:, :2], ord=2, axis=(1, 2)).max())
 
 
 # ---- the models -------------------------------------------------------------------------------

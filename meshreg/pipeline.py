@@ -21,22 +21,22 @@ import numpy as np
 
 from meshreg import judge as judging
 from meshreg import statistics
+from meshreg.calibration import probability
 from meshreg.errors import UsageError
 from meshreg.heading import (
     Turned,
     as_delivered,
     on_heading_and_scale,
-    tile_scale,
     turned_as_voted,
     turning,
 )
-from meshreg.heights import Heights, fit_heights
+from meshreg.heights import STABLE, Heights, fit_heights, stable_ground
 from meshreg.offsets import ESTIMATORS, estimate_offset, search_radius
 from meshreg.raster import rasterize
-from meshreg.raster.grid import choose_cells, coarsened, common_grid, survey_grid
-from meshreg.refine import Refined, refine
+from meshreg.raster.grid import choose_cells, coarsened, common_grid, survey_grids
+from meshreg.refine import Refined, overlap_ground, refine, with_scale
 from meshreg.settings import Settings
-from meshreg.surfaces import check_surfaces, polish
+from meshreg.surfaces import Polished, check_surfaces, polish
 from meshreg.types import (
     Float64,
     Grid,
@@ -46,6 +46,7 @@ from meshreg.types import (
     Survey,
     SurveyRaster,
     Transform,
+    Warp,
 )
 from meshreg.voting import Turn, vote
 from meshreg.warp import Internal, check_model, measure
@@ -120,8 +121,13 @@ def register_pair(
         and settings.refine.surfaces != "none"
     ):
         with clock.stage("surfaces"):
-            said = polish(
-                reference, moving, transform, decision.heights.place, error, settings.seed
+            place, ground = decision.heights.place, decision.heights.ground
+            stable = None if ground is None else (ground == STABLE, pairs["dem"][1].grid)
+            said = polish(reference, moving, transform, place, error, stable, settings.seed)
+        if said.accepted and covariance is not None:
+            covariance = _after_polishing(covariance, transform, said)
+            error = statistics.registration_error(
+                covariance, said.transform, said.transform.apply(place)
             )
         transform, notes = said.transform, [*notes, said.note]
     with clock.stage("apply"):
@@ -159,11 +165,14 @@ def register_pair(
         registration_error=error,
         internal=internal.record or None,
         warp=internal.warp,
+        false_alarm=judgement.false_alarm,
+        probability=None if judgement.best is None else probability(judgement.false_alarm),
         evidence=rasters
         | {
-            "residuals": internal.evidence or _residuals(refined),
+            "residuals": internal.evidence or _residuals(refined, transform),
+            "stable": _stable(decision.heights, transform, pairs["dem"][1], rasters, internal.warp),
+            "motion": decision.motion,
             "channels": judgement.maps,
-            "false_alarm": judgement.false_alarm,
             "masked": {
                 which: dict(pairs["dem"][i].masked)
                 for i, which in enumerate(("reference", "moving"))
@@ -298,7 +307,8 @@ def _in_frame(
         with clock.stage("refine"):
             refined = _refine(judgement, pairs, settings)
             if settings.search.free_scale or (motion is not None and motion.scale != 1.0):
-                scale = tile_scale(refined)
+                ground = overlap_ground(*pairs["dem"], refined.offset)
+                refined, scale = with_scale(refined, ground)
             if motion is not None:
                 refined, scale = as_delivered(refined, motion), scale * motion.scale
             heights = fit_heights(*first["dem"], _horizontal(refined, scale))
@@ -401,6 +411,13 @@ def _cells(settings: Settings) -> dict[str, float]:
     return {name: float(cells[name] or 0.0) for name in needed}
 
 
+def _lattice(cells: Mapping[str, float]) -> float | None:
+    """Return the lattice [m] that holds all the cells; None if the coarsest is no multiple."""
+    coarsest = max(cells.values())
+    fits = all(abs(coarsest / c - round(coarsest / c)) < 1e-9 for c in cells.values())
+    return coarsest if fits else None
+
+
 def _levels(
     survey: Survey,
     grids: Mapping[str, Grid],
@@ -435,12 +452,10 @@ def rasterize_pair(
     With a `motion` the moving survey is moved by it, and the reference taken from what is `known`.
     """
     cells = _cells(settings)
-    coarsest = max(cells.values())
-    fits = all(abs(coarsest / c - round(coarsest / c)) < 1e-9 for c in cells.values())
-    lattice = coarsest if fits else None
+    lattice = _lattice(cells)
 
     def made(survey: Survey, which: str, motion: Transform | None) -> dict[str, SurveyRaster]:
-        grids = {n: survey_grid(survey, c, lattice, transform=motion) for n, c in cells.items()}
+        grids = survey_grids(survey, cells, lattice, transform=motion)
         return _levels(survey, grids, settings, masks[which], motion)
 
     if known is not None:
@@ -488,9 +503,13 @@ def _lay_down(
     masks: Mapping[str, Any],
     pairs: Pairs,
 ) -> dict[str, Any]:
-    """Rasterize both surveys on common grids, the moving one before and after."""
+    """Rasterize both surveys on common grids, which hold the moving one before and after."""
     rasters: dict[str, Any] = {}
     grids = {name: common_grid(a.grid, b.grid) for name, (a, b) in pairs.items()}
+    if transform is not None:
+        cells = _cells(settings)
+        there = survey_grids(moving, cells, _lattice(cells), transform=transform)
+        grids = {name: common_grid(grid, there[name]) for name, grid in grids.items()}
     for name in ("dem", "ortho"):
         rasters[f"reference_{name}"] = statistics.on_grid(pairs[name][0], grids[name])
         rasters[f"moving_{name}_before"] = statistics.on_grid(pairs[name][1], grids[name])
@@ -532,8 +551,9 @@ def _covariance(refined: Refined, heights: Heights, transform: Transform) -> Flo
     """(7, 7) at the transform's pivot: the doubt of yaw and tilt grows with the lever."""
     start = np.append(refined.pivot, heights.place[2])
     covariance = np.zeros((7, 7))
-    known = [0, 1, 5, 6][: len(refined.covariance)]
+    known = [0, 1, 5]
     covariance[np.ix_(known, known)] = refined.covariance
+    covariance[6, 6] = refined.scale_variance
     carry = statistics.lever(transform.apply(heights.place) - transform.apply(start))
     covariance = carry @ covariance @ carry.T
     covariance[2:5, 2:5] += heights.covariance
@@ -543,13 +563,36 @@ def _covariance(refined: Refined, heights: Heights, transform: Transform) -> Flo
     return np.asarray(0.5 * (covariance + covariance.T))
 
 
-def _residuals(refined: Refined | None) -> dict[str, Float64]:
-    if refined is None or refined.tiles is None or refined.residuals is None:
+def _after_polishing(covariance: Float64, before: Transform, polished: Polished) -> Float64:
+    """(7, 7) at the polished transform's pivot, from that of the one before at its own."""
+    to = statistics.lever(polished.home - (before.pivot + before.offset))
+    wide = polished.widened(to @ covariance @ to.T)
+    back = statistics.lever(polished.transform.pivot + polished.transform.offset - polished.home)
+    return np.asarray(back @ wide @ back.T)
+
+
+def _stable(
+    heights: Heights | None,
+    transform: Transform | None,
+    delivered: SurveyRaster,
+    rasters: Mapping[str, Any],
+    warp: Warp | None,
+) -> Any:
+    """Return which ground told the height and the tilt, as the registered DEM lies."""
+    if heights is None or heights.ground is None or transform is None:
+        return None
+    return stable_ground(heights.ground, delivered.grid, transform, rasters["moving_dem"], warp)
+
+
+def _residuals(refined: Refined | None, transform: Transform | None) -> dict[str, Float64]:
+    if refined is None or refined.tiles is None or refined.residuals is None or transform is None:
         return {}
     assert refined.weights is not None
+    level = np.full(len(refined.tiles.places), transform.pivot[2])
+    places = transform.apply(np.column_stack([refined.tiles.places, level]))
     return {
-        "east": refined.tiles.places[:, 0],
-        "north": refined.tiles.places[:, 1],
+        "east": places[:, 0],
+        "north": places[:, 1],
         "d_east": refined.residuals[:, 0],
         "d_north": refined.residuals[:, 1],
         "weight": refined.weights,

@@ -10,16 +10,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
-from meshreg.kriging import Field, Ground, best_motion
+from meshreg.kriging import Field, Ground, best_motion, design
 from meshreg.offsets import neutral
 from meshreg.offsets.surface import MAD_TO_SIGMA
-from meshreg.tiles import MAX_YAW, Guess, TileOffsets, correlated_tiles, polished_tiles
+from meshreg.tiles import MAX_YAW, Guess, Relief, TileOffsets, correlated_tiles, polished_tiles
 from meshreg.types import Float64, SurveyRaster
 
 MIN_TILES = 6
+LEAST_FOR_SCALE = 12  # tiles, for a scale of their own
+UNKNOWN_SCALE = 0.01 / 3  # sigma: beyond 1 % a scale is plainly wrong, and found before (`voting`)
 NODES = 20  # along the overlap's side
 # Of the variance: internal warps are neither Gaussian nor alike everywhere, as kriging takes them
 # to be. Measured (`meshreg benchmark`, coverage of the stated region), not derived.
@@ -36,19 +39,19 @@ class Refined:
     Attributes
     ----------
     pivot : (2,) float64
-        Absolute east and north [m] in the moving survey, centre of the tiles used.
+        Absolute east and north [m] in the moving survey, centroid of the overlap.
     offset : (2,) float64
         East and north [m] at the pivot.
     yaw : float
         Anticlockwise turn of the moving survey [rad]; 0 where it is not significant.
     covariance : (3, 3) float64
         Of (east, north, yaw).
+    scale_variance : float
+        Of the scale by which lengths are multiplied, where one was fitted (`with_scale`); else 0.
     tiles : TileOffsets or None
     residuals : (M, 2) float64
         Tile offset less the rigid answer's [m].
     weights : (M,) float64
-    field : Field or None
-        Most likely offset at any place, internal warp included.
     note : str
         What the user should know.
     doubt : str
@@ -62,9 +65,9 @@ class Refined:
     tiles: TileOffsets | None = None
     residuals: Float64 | None = None
     weights: Float64 | None = None
-    field: Field | None = None
     note: str = ""
     doubt: str = ""
+    scale_variance: float = 0.0
 
 
 def refine(
@@ -93,10 +96,10 @@ def refine(
     if not _enough(tiles):
         return replace(coarse, note="too few tiles match on their own to measure yaw")
     assert tiles is not None
-    rough = fit(tiles, centre, yaw_free=True)
+    rough = fit(tiles, centre)
     assert rough.weights is not None
     kept = tiles.only(rough.weights > 0)
-    best = over_ground(kept, ground, centre) if _enough(kept) else rough
+    best = over_ground(kept, ground, centre)[0] if _enough(kept) else rough
     cells = [moving.grid.cell for _, moving, _ in rasters]
     best = _stated(best, PEAK_RESOLUTION * max(cells))
     for reference, moving, channel in rasters:
@@ -124,26 +127,25 @@ def _polished(
     reference: SurveyRaster, moving: SurveyRaster, ground: Ground, start: Refined
 ) -> Refined | None:
     """Polish the tiles from the rigid answer, and again from what they say, until it stays."""
-    turn = start.yaw * np.array([[0.0, -1.0], [1.0, 0.0]])
-    centre, offset = start.pivot, start.offset
-    guess: Guess = lambda places: start.offset + (places - centre) @ turn.T  # noqa: E731
+    still, moved, offset = Relief.of(reference), Relief.of(moving), start.offset
+    guess: Guess = partial(_rigid, start)
     for _ in range(4):
-        tiles = polished_tiles(reference, moving, offset, guess)
+        tiles = polished_tiles(still, moved, offset, guess)
         if not _enough(tiles):
             return None
         assert tiles is not None
-        answer = over_ground(tiles, ground, centre)
-        assert answer.field is not None
-        moved, offset, guess = np.hypot(*(answer.offset - offset)), answer.offset, answer.field
-        if moved < 0.005 * moving.grid.cell:
+        answer, guess = over_ground(tiles, ground, start.pivot)
+        step, offset = np.hypot(*(answer.offset - offset)), answer.offset
+        if step < 0.005 * moving.grid.cell:
             break
     return answer
 
 
-def over_ground(tiles: TileOffsets, ground: Ground, pivot: Float64) -> Refined:
+def over_ground(tiles: TileOffsets, ground: Ground, pivot: Float64) -> tuple[Refined, Field]:
     """Rigid motion that fits the whole ground best; the yaw is 0 where it is under two sigmas.
 
-    The ground counts as the reference sees it: where the models stretch, so do its cells.
+    The ground counts as the reference sees it: where the models stretch, so do its cells. Also
+    returned is the most likely offset at any place, internal warp included.
     """
     places, offsets = tiles.places, tiles.offsets
     motion = best_motion(places, offsets, ground, pivot, yaw_free=True)
@@ -156,10 +158,40 @@ def over_ground(tiles: TileOffsets, ground: Ground, pivot: Float64) -> Refined:
         still = best_motion(places, offsets, ground, pivot, yaw_free=False, start=motion)
         yaw, offset = 0.0, still.answer
         covariance = _block_diagonal(still.covariance, covariance[2, 2])
-    arm = places - pivot
-    left = offsets - offset - yaw * np.stack([-arm[:, 1], arm[:, 0]], axis=1)
     used = motion.used.astype(np.float64)
-    return Refined(pivot, offset, yaw, covariance, tiles, left, used, motion.field)
+    answer = Refined(pivot, offset, yaw, covariance, tiles, weights=used)
+    return _with_residuals(answer), motion.field
+
+
+def with_scale(refined: Refined, ground: Ground) -> tuple[Refined, float]:
+    """Return the answer that knows the variance of its scale, and the scale.
+
+    That of the similarity which fits all of the ground best, from the refined tiles by kriging, as
+    the rest of the answer; 1, known to a third of a per cent, where they are too few.
+    """
+    tiles = refined.tiles
+    if tiles is None or len(tiles.places) < LEAST_FOR_SCALE:
+        return replace(refined, scale_variance=UNKNOWN_SCALE**2), 1.0
+    motion = best_motion(
+        tiles.places, tiles.offsets, ground, refined.pivot, yaw_free=True, scale_free=True
+    )
+    similar = motion.answer[2:] + np.array([0.0, 1.0])  # s sin psi, s cos psi
+    scale = float(np.hypot(*similar))
+    slope = similar / scale
+    variance = MISFIT * float(slope @ motion.covariance[2:, 2:] @ slope)
+    return replace(refined, scale_variance=variance / scale**2), scale
+
+
+def _rigid(refined: Refined, places: Float64) -> Float64:
+    """Offset (N, 2) [m] that the answer means at places (N, 2)."""
+    arm = places - refined.pivot
+    return refined.offset + refined.yaw * np.stack([-arm[:, 1], arm[:, 0]], axis=1)
+
+
+def _with_residuals(refined: Refined) -> Refined:
+    assert refined.tiles is not None
+    left = refined.tiles.offsets - _rigid(refined, refined.tiles.places)
+    return replace(refined, residuals=left)
 
 
 def _with_surer_yaw(refined: Refined, other: Refined) -> Refined:
@@ -169,15 +201,10 @@ def _with_surer_yaw(refined: Refined, other: Refined) -> Refined:
     """
     if other.covariance[2, 2] > 0.25 * refined.covariance[2, 2]:
         return refined
-    assert refined.tiles is not None
-    assert refined.residuals is not None
-    arm = refined.tiles.places - refined.pivot
-    more = other.yaw - refined.yaw
-    left = refined.residuals - more * np.stack([-arm[:, 1], arm[:, 0]], axis=1)
     covariance = refined.covariance.copy()
     covariance[2], covariance[:, 2] = 0.0, 0.0
     covariance[2, 2] = other.covariance[2, 2]
-    return replace(refined, yaw=other.yaw, residuals=left, covariance=covariance)
+    return _with_residuals(replace(refined, yaw=other.yaw, covariance=covariance))
 
 
 def _enough(tiles: TileOffsets | None) -> bool:
@@ -188,40 +215,29 @@ def _size(refined: Refined) -> float:
     return float(np.trace(refined.covariance[:2, :2]))
 
 
-def fit(tiles: TileOffsets, pivot: Float64, *, yaw_free: bool, iterations: int = 20) -> Refined:
+def fit(tiles: TileOffsets, pivot: Float64) -> Refined:
     """Robust rigid fit of tile offsets: ``d = t + yaw * (-(n - n0), e - e0)``.
 
     Tukey's biweight at 4 robust deviations, one deviation per channel. The covariance is the
     block sandwich ``H⁻¹ (sum_b g_b g_b') H⁻¹``, since channels at one place err alike.
     """
-    arm = tiles.places - pivot
-    count = 3 if yaw_free else 2
-    design = np.zeros((len(arm), 2, 3))
-    design[:, 0, 0] = design[:, 1, 1] = 1.0
-    design[:, 0, 2], design[:, 1, 2] = -arm[:, 1], arm[:, 0]
-    design = design[:, :, :count]
-    answer = np.zeros(count)
-    answer[:2] = np.median(tiles.offsets, axis=0)
-    if yaw_free:
-        answer[2] = _median_turn(tiles, pivot, answer[:2])
-    weights = np.ones(len(arm))
-    for _ in range(iterations):
-        residual = tiles.offsets - design @ answer
+    columns = design(tiles.places, pivot, 3)
+    middle = np.median(tiles.offsets, axis=0)
+    answer = np.append(middle, _median_turn(tiles, pivot, middle))
+    for _ in range(20):
+        residual = tiles.offsets - columns @ answer
         size = np.hypot(*residual.T)
         scale = _scales(size, tiles.channel)
         weights = np.clip(1 - (size / (4 * scale)) ** 2, 0, None) ** 2 / scale**2
-        normal = np.einsum("mij,m,mik->jk", design, weights, design)
-        step = np.linalg.solve(normal, np.einsum("mij,m,mi->j", design, weights, residual))
+        normal = np.einsum("mij,m,mik->jk", columns, weights, columns)
+        step = np.linalg.solve(normal, np.einsum("mij,m,mi->j", columns, weights, residual))
         answer = answer + step
         if np.abs(step[:2]).max() < 1e-9:
             break
-    residual = tiles.offsets - design @ answer
-    covariance = np.zeros((3, 3))
-    covariance[:count, :count] = _sandwich(design, weights, residual, tiles.block)
-    if not yaw_free:
-        covariance[2, 2] = fit(tiles, pivot, yaw_free=True, iterations=3).covariance[2, 2]
-    yaw = float(answer[2]) if yaw_free else 0.0
-    return Refined(pivot, answer[:2], yaw, covariance, tiles, residual, weights / weights.max())
+    residual = tiles.offsets - columns @ answer
+    covariance = _sandwich(columns, weights, residual, tiles.block)
+    weights = weights / weights.max()
+    return Refined(pivot, answer[:2], float(answer[2]), covariance, tiles, residual, weights)
 
 
 def _median_turn(tiles: TileOffsets, pivot: Float64, offset: Float64) -> float:
@@ -242,13 +258,13 @@ def _scales(size: Float64, channel: np.ndarray) -> Float64:
     return scale
 
 
-def _sandwich(design: Float64, weights: Float64, residual: Float64, block: np.ndarray) -> Float64:
-    bread = np.linalg.inv(np.einsum("mij,m,mik->jk", design, weights, design))
-    scores = np.einsum("mij,m,mi->mj", design, weights, residual)
+def _sandwich(columns: Float64, weights: Float64, residual: Float64, block: np.ndarray) -> Float64:
+    bread = np.linalg.inv(np.einsum("mij,m,mik->jk", columns, weights, columns))
+    scores = np.einsum("mij,m,mi->mj", columns, weights, residual)
     names = np.unique(block)
     sums = np.array([scores[block == name].sum(axis=0) for name in names])
     sums -= sums.mean(axis=0)
-    freedom = len(names) / max(len(names) - design.shape[2], 1)
+    freedom = len(names) / max(len(names) - columns.shape[2], 1)
     return np.asarray(bread @ (sums.T @ sums) @ bread * freedom)
 
 
@@ -272,7 +288,7 @@ def _joined(found: Sequence[TileOffsets | None]) -> TileOffsets | None:
 
 
 def overlap_ground(
-    reference: SurveyRaster, moving: SurveyRaster, offset: tuple[float, float]
+    reference: SurveyRaster, moving: SurveyRaster, offset: tuple[float, float] | Float64
 ) -> Ground:
     """Places [m] in the moving survey that stand for its cells that fall on reference cells."""
     mask = moving.valid if moving.valid.any() else moving.color_valid

@@ -2,23 +2,26 @@
 
 A DEM sees a reef from above; its overhangs and walls, where much of the coral is, are seen only
 here. Opt-in (`refine.surfaces = "gicp"`), since it needs Open3D, and believed only where it is a
-small step that makes the surfaces agree better.
+small step that makes the surfaces agree better. It looks at ground that has not changed, as the
+heights tell it, and is never surer than what it started from: a fit of points that lie close
+already does not see how the models bend.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from meshreg.errors import UsageError
-from meshreg.types import Float64, Maps, Mesh, Survey, Transform
+from meshreg.types import Bool, Float64, Grid, Maps, Mesh, Survey, Transform
 
 GATE = 0.03  # m: points further apart have changed, or are not the same surface
 MAX_POINTS = 1_000_000
 SURFACES = ("none", "gicp")
+BLOCKS = 7  # along the longer side: parcels of ground that err alike
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,6 +40,12 @@ class Polished:
         pairs within the gate.
     note : str
         What the user should know.
+    home : (3,) float64
+        Where the step was taken: the overlap's centroid, absolute in the reference [m].
+    step : (6,) float64
+        East, north, up [m] and right-handed turns about these [rad] that were added there.
+    scatter : (6, 6) float64
+        Covariance of the step there, from blocks of ground; zero where they are too few.
     """
 
     transform: Transform
@@ -45,6 +54,24 @@ class Polished:
     before: float
     after: float
     note: str
+    home: Float64 = field(default_factory=lambda: np.zeros(3))
+    step: Float64 = field(default_factory=lambda: np.zeros(6))
+    scatter: Float64 = field(default_factory=lambda: np.zeros((6, 6)))
+
+    def widened(self, covariance: Float64) -> Float64:
+        """Return what the covariance (7, 7) at `home` of the pose given becomes.
+
+        Nowhere smaller than that, nor than the scatter of the blocks; and the step itself, by
+        which two ways of reading the same ground differ, counts as one deviation.
+        """
+        if not self.accepted:
+            return covariance
+        # angles in metres at a metre's arm, so that the eigenvalues are of one unit
+        values, axes = np.linalg.eigh(self.scatter - covariance[:6, :6])
+        more = (axes * np.maximum(values, 0.0)) @ axes.T + np.outer(self.step, self.step)
+        wide = covariance.copy()
+        wide[:6, :6] += 0.5 * (more + more.T)
+        return wide
 
 
 def check_surfaces(kind: str) -> None:
@@ -61,6 +88,7 @@ def polish(
     transform: Transform,
     place: Float64,
     error: Mapping[str, Any] | None,
+    stable: tuple[Bool, Grid] | None,
     seed: int = 0,
     max_points: int = MAX_POINTS,
 ) -> Polished:
@@ -79,6 +107,9 @@ def polish(
         Centroid of the overlap, absolute in the moving survey [m].
     error : mapping or None
         Standard deviations x, y, z there [m] (`Registration.registration_error`).
+    stable : ((H, W) bool, Grid) or None
+        Where the ground has not changed, in the moving survey as delivered: masked, changed and
+        unknown cells are False. None where it could not be told, and nothing is polished.
     seed : int
         Of the points' draw.
     max_points : int
@@ -98,16 +129,20 @@ def polish(
     if isinstance(reference.geometry, Maps) or isinstance(moving.geometry, Maps):
         return _kept(transform, "maps have no 3-D surface to polish on")
     o3d = _open3d()
+    if stable is None:
+        return _kept(transform, "too little stable ground to polish on")
     home = transform.apply(place)
     rng = np.random.default_rng(seed)
     fixed = sampled(reference, max_points, rng) - home
-    loose = transform.apply(sampled(moving, max_points, rng)) - home
-    fixed, loose = _shared(fixed, loose)
-    if min(len(fixed), len(loose)) < 1000:
+    points = sampled(moving, max_points, rng)
+    loose, trusted = transform.apply(points) - home, _trusted(points, *stable)
+    fixed, (loose, trusted) = _shared(fixed, loose, trusted)
+    if min(len(fixed), int(trusted.sum())) < 1000:
         return _kept(transform, "too few points in common to polish on")
     clouds = [o3d.geometry.PointCloud(o3d.utility.Vector3dVector(p)) for p in (loose, fixed)]
     for cloud in clouds:
         cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(20))
+    clouds[0], loose = clouds[0].select_by_index(np.flatnonzero(trusted)), loose[trusted]
     pipeline = o3d.pipelines.registration
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
         start = pipeline.evaluate_registration(*clouds, GATE, np.eye(4))
@@ -123,8 +158,9 @@ def polish(
         )
     step = _proper(np.asarray(found.transformation))
     moved = np.abs(step.offset)
-    before, after = (
-        _distance(fixed, clouds[1], step_.apply(loose)) for step_ in (Transform(), step)
+    (before, _), (after, scatter) = (
+        _agreement(fixed, np.asarray(clouds[1].normals), s.apply(loose))
+        for s in (Transform(), step)
     )
     sigma = np.array([error[axis] for axis in "xyz"]) if error else np.zeros(3)
     small = bool((moved <= np.maximum(3 * sigma, GATE)).all())
@@ -135,13 +171,15 @@ def polish(
         return Polished(
             transform, False, length, before, after, f"polishing on the surfaces is left out: {why}"
         )
+    turn = 0.5 * (step.rotation - step.rotation.T)  # of milliradians: the vector of the turn
+    taken = np.append(step.offset, [turn[2, 1], turn[0, 2], turn[1, 0]])
     step = Transform(step.rotation, 1.0, step.offset, home)
     note = (
         f"polished on the surfaces: moved by {1000 * length:.1f} mm, "
         f"distance {1000 * before:.1f} mm to {1000 * after:.1f} mm rms"
     )
     whole = (step @ transform).at(transform.pivot)
-    return Polished(whole, True, length, before, after, note)
+    return Polished(whole, True, length, before, after, note, home, taken, scatter)
 
 
 def sampled(survey: Survey, count: int, rng: np.random.Generator) -> Float64:
@@ -167,26 +205,57 @@ def sampled(survey: Survey, count: int, rng: np.random.Generator) -> Float64:
     return np.asarray(a + u * (b - a) + v * (c - a) + survey.origin)
 
 
-def _shared(fixed: Float64, loose: Float64) -> tuple[Float64, Float64]:
+def _trusted(points: Float64, stable: Bool, grid: Grid) -> Bool:
+    """Tell which points (N, 3) stand on ground that has not changed."""
+    at = np.rint(np.stack(grid.row_col(points[:, 0], points[:, 1]))).astype(int)
+    rows, cols = grid.shape
+    inside = np.asarray((at[0] >= 0) & (at[0] < rows) & (at[1] >= 0) & (at[1] < cols))
+    inside[inside] = stable[tuple(at[:, inside])]
+    return inside
+
+
+def _shared(fixed: Float64, loose: Float64, trusted: Bool) -> tuple[Float64, tuple[Float64, Bool]]:
     """Return the points of each within the other's bounding box and the gate."""
     kept = []
     for own, other in ((fixed, loose), (loose, fixed)):
         if not len(other):
-            return fixed[:0], loose[:0]
+            return fixed[:0], (loose[:0], trusted[:0])
         low, high = other.min(axis=0) - GATE, other.max(axis=0) + GATE
-        kept.append(own[((own >= low) & (own <= high)).all(axis=1)])
-    return kept[0], kept[1]
+        kept.append(((own >= low) & (own <= high)).all(axis=1))
+    return fixed[kept[0]], (loose[kept[1]], trusted[kept[1]])
 
 
-def _distance(fixed: Float64, cloud: Any, loose: Float64) -> float:
+def _agreement(fixed: Float64, normals: Float64, loose: Float64) -> tuple[float, Float64]:
+    """Rms distance [m] from the tangent planes, and the block covariance (6, 6) of the fit.
+
+    With ``r = n . (p - q)`` and ``J = (n, p × n)``, weights by Tukey's biweight over the gate: the
+    sandwich ``H⁻¹ (sum_b g_b g_b') H⁻¹`` over square blocks of ground, as of the heights, since
+    neighbours err alike. Zero where fewer than two blocks a parameter are left.
+    """
     from scipy.spatial import cKDTree
 
     loose = loose[:: max(1, len(loose) // 100_000)]
     far, which = cKDTree(fixed).query(loose, distance_upper_bound=GATE)
     near = np.isfinite(far)
-    normals = np.asarray(cloud.normals)[which[near]]
-    along = ((loose[near] - fixed[which[near]]) * normals).sum(axis=1)
-    return float(np.sqrt(np.mean(along**2))) if near.any() else float("nan")
+    if not near.any():
+        return float("nan"), np.zeros((6, 6))
+    points, normal = loose[near], normals[which[near]]
+    along = ((points - fixed[which[near]]) * normal).sum(axis=1)
+    rms = float(np.sqrt(np.mean(along**2)))
+    design = np.hstack([normal, np.cross(points, normal)])
+    weight = (1 - (along / GATE) ** 2) ** 2
+    low = points[:, :2].min(axis=0)
+    side = float(np.ptp(points[:, :2], axis=0).max()) / BLOCKS
+    cell = ((points[:, :2] - low) / side).astype(int)
+    _, block = np.unique(cell[:, 0] * (BLOCKS + 1) + cell[:, 1], return_inverse=True)
+    count = int(block.max()) + 1
+    if count < 12:
+        return rms, np.zeros((6, 6))
+    scores = design * (weight * along)[:, None]
+    sums = np.stack([np.bincount(block, scores[:, k], count) for k in range(6)], axis=1)
+    sums -= sums.mean(axis=0)
+    bread = np.linalg.pinv((design * weight[:, None]).T @ design, hermitian=True)
+    return rms, np.asarray(bread @ (sums.T @ sums) @ bread * count / (count - 6))
 
 
 def _proper(matrix: Float64) -> Transform:

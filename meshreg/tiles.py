@@ -40,24 +40,17 @@ class TileOffsets:
         Tiles at the same place share a block, whichever channel saw them.
     channel : (M,) int
         Which of the channels matched it.
-    level : (M,) float64 or None
-        Mean height [m] of the moving tile, absolute.
-    rise : (M,) float64 or None
-        Median height [m] to add to it, once it lies where `offsets` puts it.
     """
 
     places: Float64
     offsets: Float64
     block: np.ndarray
     channel: np.ndarray
-    level: Float64 | None = None
-    rise: Float64 | None = None
 
     def only(self, keep: Bool) -> TileOffsets:
         """Return the tiles where `keep` (M,) is True."""
-        optional = (None if value is None else value[keep] for value in (self.level, self.rise))
         several = (self.places, self.offsets, self.block, self.channel)
-        return TileOffsets(*(value[keep] for value in several), *optional)
+        return TileOffsets(*(value[keep] for value in several))
 
 
 @dataclass(frozen=True)
@@ -161,13 +154,13 @@ def _correlate_tile(
 
 
 def polished_tiles(
-    reference: SurveyRaster, moving: SurveyRaster, offset: Float64, guess: Guess
+    reference: Relief, moving: Relief, offset: Float64, guess: Guess
 ) -> TileOffsets | None:
     """Read each tile's offset by robust Gauss-Newton on high-passed heights.
 
     Parameters
     ----------
-    reference, moving : SurveyRaster
+    reference, moving : Relief
     offset : (2,) float64
         East and north [m] of the whole, which says where the surveys overlap.
     guess : callable
@@ -180,16 +173,15 @@ def polished_tiles(
     side = int(np.clip(overlap.side // 7, 16, TILE_CELLS))
     if overlap.side < 3 * side:
         return None
-    still, moved = _Relief.of(reference), _Relief.of(moving)
     bend = _Bend.of(guess, moving.grid, side)
     half = 0.5 * (side - 1)
     found = []
     for top, left in overlap.tiles(side):
-        answer = _polish(still, moved, (top, left, side), bend)
+        answer = _polish(reference, moving, (top, left, side), bend)
         if answer is not None:
             middle = np.array([top + half, left + half])
             start = bend.at(middle[:, None])[0]
-            found.append((*moving.grid.east_north(*middle), *(start + answer[:2]), *answer[2:]))
+            found.append((*moving.grid.east_north(*middle), *(start + answer)))
     return _as_tiles(found, 0)
 
 
@@ -220,14 +212,10 @@ class _Bend:
 
 
 @dataclass(frozen=True, eq=False)
-class _Relief:
-    """High-passed heights as a cubic spline, their slopes per metre, and where they are known.
-
-    `height` is absolute [m], 0 where unknown.
-    """
+class Relief:
+    """High-passed heights, also as a cubic spline, their slopes per metre, where they are known."""
 
     grid: Grid
-    height: Float64
     field: Float64
     spline: Float64
     d_east: Float64
@@ -235,7 +223,8 @@ class _Relief:
     mask: Bool
 
     @classmethod
-    def of(cls, raster: SurveyRaster) -> _Relief:
+    def of(cls, raster: SurveyRaster) -> Relief:
+        """Prepare a survey's heights."""
         from scipy.ndimage import binary_erosion, spline_filter
 
         mask = raster.valid
@@ -245,15 +234,14 @@ class _Relief:
         d_row, d_col = (np.asarray(d, np.float64) for d in np.gradient(field))
         inner = binary_erosion(mask, iterations=3, border_value=0)
         cell = raster.grid.cell
-        whole = np.where(mask, raster.height.astype(np.float64) + raster.datum, 0.0)
         spline = spline_filter(field, 3)
-        return cls(raster.grid, whole, field, spline, d_col / cell, -d_row / cell, inner)
+        return cls(raster.grid, field, spline, d_col / cell, -d_row / cell, inner)
 
 
 def _polish(
-    still: _Relief, moved: _Relief, tile: tuple[int, int, int], bend: _Bend
+    still: Relief, moved: Relief, tile: tuple[int, int, int], bend: _Bend
 ) -> Float64 | None:
-    """Find what to add to the bent offset [m] so that a tile fits; also its level and rise.
+    """Find what to add to the bent offset [m] so that a tile fits.
 
     Residual ``r = f1(u + b(u) + t) - f2(u)``, Tukey's biweight at four robust deviations, slopes
     as the mean of both surveys' (so that neither survey's noise shrinks the step).
@@ -292,25 +280,13 @@ def _polish(
         offset = offset + step
         if np.abs(step).max() < 1e-7:
             break
-    if not (
-        np.abs(step).max() < 0.01 * still.grid.cell and np.hypot(*offset) <= 3 * still.grid.cell
-    ):
-        return None
-    level = moved.height[row, col]
-    rise = map_coordinates(still.height, at, order=1) - level[inside]
-    return np.array([*offset, level.mean(), np.median(rise[weight > 0])])
+    still_there = np.hypot(*offset) <= 3 * still.grid.cell
+    return offset if still_there and np.abs(step).max() < 0.01 * still.grid.cell else None
 
 
 def _as_tiles(found: list[tuple[Any, ...]], channel: int) -> TileOffsets | None:
     if not found:
         return None
     rows = np.array(found, float)
-    numbers, whole = np.arange(len(rows)), rows.shape[1] > 4
-    return TileOffsets(
-        rows[:, :2],
-        rows[:, 2:4],
-        numbers,
-        np.full(len(rows), channel),
-        rows[:, 4] if whole else None,
-        rows[:, 5] if whole else None,
-    )
+    number = len(rows)
+    return TileOffsets(rows[:, :2], rows[:, 2:], np.arange(number), np.full(number, channel))

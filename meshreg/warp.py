@@ -22,6 +22,7 @@ from meshreg.types import Float64, SurveyRaster, Transform, Warp
 from meshreg.warp_rasters import LEAST_TILES, height_tiles
 
 CHOICES = ("none", "auto", *MODELS[1:])
+_MANY = 0.1  # of the tiles: worth saying
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,16 +186,22 @@ def _told(flat: _Part, up: _Part | None, options: WarpSettings) -> Internal:
     phrases = [p for p in (_flat_phrase(parts), _up_phrase(parts)) if p]
     if phrases:
         said = f"translation is not enough: {' and '.join(phrases)}"
-        strain = max(part["strain"] for part in parts.values())
-        if strain > options.max_strain:
-            said += (
-                f"; that strains them by up to {strain:.1%}, over the {options.max_strain:.1%} "
-                "(warp.max_strain) up to which a warp is applied"
-            )
+        for name, part in parts.items():
+            if part["strain"] > options.max_strain:
+                said += (
+                    f"; the {name} bend strains the survey by {part['strain']:.1%}, over the "
+                    f"{options.max_strain:.1%} (warp.max_strain) up to which a warp is applied"
+                )
     else:
         rms = [_length(part["held_out_rigid"]) for part in parts.values()]
         also = f" and {rms[1]} in height" if len(rms) > 1 else ""
         said = f"a rigid move is enough: its tiles agree to {rms[0]} rms{also}"
+        for name, part in parts.items():
+            if part["set_aside"] >= _MANY * part["tiles"]:
+                said += (
+                    f"; {part['set_aside']} of {part['tiles']} tiles lie apart ({name}), "
+                    "as changed ground does"
+                )
     bent = (allowed.horizontal, allowed.vertical) != ("rigid", "rigid")
     record: dict[str, Any] = {"said": said, "applied": False, "horizontal": None, "vertical": None}
     evidence = _tile_evidence(said, named, flat, up)

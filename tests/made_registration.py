@@ -109,7 +109,17 @@ def evidence(verdict: str) -> dict[str, Any]:
             "d_north": 0.003 * x - 0.002,
             "weight": np.linspace(0.3, 1, x.size),
         }
+        arrays["stable"] = ground()
     return arrays
+
+
+def ground() -> np.ndarray:
+    """Which cells told the height: 3 those of a field, 2 a block in it, 1 a stripe, 0 the rest."""
+    state = np.zeros((260, 240), np.uint8)
+    state[30:230, 40:220] = 3
+    state[60:100, 80:120] = 2
+    state[150:160, 60:200] = 1
+    return state
 
 
 def survey_entry(name: str) -> dict[str, Any]:

@@ -12,6 +12,7 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import jsonschema
@@ -25,9 +26,11 @@ import meshreg
 import meshreg.pipeline
 from meshreg import cli
 from meshreg.cli_parts import common, console, info, machine
+from meshreg.cli_parts.arguments import Axes
 from meshreg.cli_parts.options import for_both, join_settings, read_options
 from meshreg.doctor import Check, run_probe
 from meshreg.errors import InputError, UsageError
+from meshreg.io.document import read_registration
 from meshreg.settings import Settings
 from meshreg.types import Grid, Maps, Mesh, PointCloud, Survey, Transform
 
@@ -286,6 +289,40 @@ def test_a_crs_on_one_side_only_is_no_obstacle(tmp_path: Path, run: Run, side: s
     again = meshreg.read_survey(out / "new_registered.ply")
     assert again.crs == known
     assert np.abs(again.centre - moving.centre - [731_000, 5_705_000, 0] - found).max() < 0.01
+
+
+def test_geometry_alone_where_the_texture_is_broken(
+    tmp_path: Path, run: Run, verdict: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every command that reads a survey takes the option that its error message names."""
+    asked = verdict("accepted")
+    monkeypatch.setattr(
+        "meshreg.selftest.self_test",
+        lambda *surveys, **rest: SimpleNamespace(document=lambda: {"verdict": "accepted"}),
+    )
+    old, new = (write_obj(tmp_path / f"{name}.obj", k) for k, name in enumerate(("old", "new")))
+    broken = new.read_text().replace("f 1 2 10", "vt 0 0\nusemtl m\nf 1/1 2/1 10/9")
+    new.write_text("mtllib new.mtl\n" + broken)
+    (tmp_path / "new.mtl").write_text("newmtl m\nmap_Kd new.png\n")
+    Image.new("RGB", (4, 4)).save(tmp_path / "new.png")
+    jobs: tuple[tuple[object, ...], ...] = (
+        ("register", old, new, "-o", tmp_path / "out"),
+        ("selftest", old, new),
+        ("rasterize", new, "-o", tmp_path / "maps"),
+        ("info", new),
+        ("apply", tmp_path / "out", new, "-o", tmp_path / "moved"),
+    )
+    for job in jobs:
+        code, said, error = run(*job, "--json")
+        assert code == 3
+        assert "--geometry-only" in json.loads(said)["error"]["remedy"]
+        code, said, error = run(*job, "--geometry-only", "--json")
+        assert code == 0, (job, said, error)
+    assert asked["moving"].geometry.uv is None
+    assert len(asked["moving"].geometry.faces) == 98
+    # and what is written keeps the file's own bytes, the broken ones too
+    assert "10/9" in (tmp_path / "out" / "new_registered.obj").read_text()
+    assert "10/9" in next((tmp_path / "moved").glob("new*.obj")).read_text()
 
 
 def test_two_models_of_unknown_scale_need_one(tmp_path: Path, run: Run, verdict: Any) -> None:
@@ -738,6 +775,15 @@ def test_info_says_what_is_there(pair: tuple[str, str], run: Run) -> None:
         assert words in said
 
 
+def test_info_reads_a_model_as_register_does(tmp_path: Path, run: Run) -> None:
+    model = ROOT / "tests" / "data" / "colmap"
+    plain, scaled = (
+        json.loads(run("info", model, "--json", *more)[1]) for more in ((), ("--scale", 2.5))
+    )
+    assert not plain["scale_known"]
+    np.testing.assert_allclose(scaled["size"], 2.5 * np.array(plain["size"]), rtol=1e-6)
+
+
 def tilted(angle: float, axis: str = "x") -> Survey:
     """A rough square of ground, turned about an axis."""
     rng = np.random.default_rng(8)
@@ -864,7 +910,7 @@ def test_values_for_one_or_both() -> None:
     assert for_both("--scale", [2.0, 3.0]) == (2.0, 3.0)
     assert read_options(None, "--shift").shift is None
     assert read_options("-1.5,2e3, 0", "--shift").shift == (-1.5, 2000.0, 0.0)
-    assert type(read_options(None, "--shift", axes=cli.Axes.ned).axes) is str
+    assert type(read_options(None, "--shift", axes=Axes.ned).axes) is str
 
 
 def test_bars_on_a_terminal() -> None:
@@ -976,6 +1022,49 @@ def test_surveys_of_different_places_are_rejected(tmp_path: Path, run: Run) -> N
         "report.html",
     }
     assert {path.stem for path in (tmp_path / "o" / "figures").iterdir()} == {"extents"}
+
+
+def test_colmap_models_made_and_registered(tmp_path: Path, run: Run) -> None:
+    """As the README says: the models' own frames are arbitrary, their camera positions place them.
+
+    The truth is that of `synth`, as far as the positions place the models: they err little here.
+    """
+    pair = tmp_path / "pair"
+    code, said, error = run(
+        "synth", "abrolhos_12mo", "--format", "colmap", "--size", 6, "-o", pair, "--json",
+        "--set", "sfm.nav_noise=0.001",
+    )  # fmt: skip
+    assert code == 0, error
+    truth = json.loads((pair / "truth.json").read_text())
+    models = [pair / name for name in ("reference", "moving")]
+    code, said, error = run("register", *models, "-o", tmp_path / "none")
+    assert code == 2
+    assert "--positions" in error
+    for model in models:
+        code, said, _ = run("info", model, "--positions", model / "positions.csv", "--json")
+        document = json.loads(said)
+        assert code == 0
+        assert document["scale_known"]
+        assert document["size"][:2] == pytest.approx([6.0, 6.0], abs=0.4)
+        assert document["bounds"]["low"][1] > 6.8e6
+    places = [word for model in models for word in ("--positions", model / "positions.csv")]
+    out = tmp_path / "out"
+    code, said, error = run("register", *models, *places, "-o", out, "--json")
+    assert code == 0, said + error
+    found = read_registration(out)
+    centroid = np.array(truth["centroid"])
+    miss = found.transform.apply(centroid) - centroid - truth["offset"]
+    sigma = np.array([found.registration_error[axis] for axis in "xyz"])
+    assert (np.abs(miss) < 4 * sigma).all()
+    assert sigma.max() < 0.03
+    # the registered model is in the reference model's own frame: the same positions place it
+    positions = models[0] / "positions.csv"
+    reference = meshreg.read_survey(models[0], positions=positions)
+    moving = meshreg.read_survey(models[1], positions=models[1] / "positions.csv")
+    again = meshreg.read_survey(out / "moving_registered")
+    want = found.transform.apply(moving.geometry.points + moving.origin)
+    np.testing.assert_allclose(again.geometry.points + again.origin, want, atol=1e-3)
+    assert np.abs(again.centre - reference.centre).max() < 1.0
 
 
 def test_missing_texture_is_said_loudly(tmp_path: Path, run: Run) -> None:

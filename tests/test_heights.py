@@ -14,7 +14,15 @@ from made_registration import made_registration
 
 from meshreg import statistics
 from meshreg.errors import UsageError
-from meshreg.heights import MAX_TILT, fit_heights, rotation
+from meshreg.heights import (
+    CHANGED,
+    MAX_TILT,
+    SET_ASIDE,
+    STABLE,
+    fit_heights,
+    rotation,
+    stable_ground,
+)
 from meshreg.types import Transform
 
 HERE = Transform()
@@ -102,6 +110,48 @@ def test_growth_on_one_side_does_not_pull(height):
     assert abs(found.up) < 0.003  # the mean would say 24 mm
     assert np.abs(np.rad2deg(found.tilt)).max() < 0.03
     assert 1 - found.kept == pytest.approx(grown.mean(), abs=0.15)
+
+
+def test_ground_that_changed_is_told_from_ground_that_did_not():
+    """Colonies grew by 10 cm, and the whole of a square of 2.4 m was washed out by 30 cm."""
+    other = relief(noise_seed=1)
+    grown = patches(other, 0.08, 7, width=0.3)
+    east, north = places(other)
+    washed = (np.abs(east - 2.0) < 1.2) & (np.abs(north + 1.5) < 1.2)
+    change = np.where(washed, 0.3, np.where(grown, -0.1, 0.0))
+    found = fit_heights(relief(), lowered(other, change), HERE)
+    assert found.ground.shape == other.grid.shape
+    # blocks are 0.8 m wide: what reaches into one of them beside the square goes with it
+    near = (np.abs(east - 2.0) < 2.0) & (np.abs(north + 1.5) < 2.0)
+    inner = (np.abs(east) < 6.5) & (np.abs(north) < 6.5)  # splines need neighbours
+    stable = found.ground == STABLE
+    assert stable[inner & ~near & ~grown].mean() > 0.95
+    assert stable[inner & grown & ~near].mean() < 0.05
+    assert (found.ground[inner & grown & ~near] == CHANGED).mean() > 0.9
+    assert stable[washed].mean() < 0.05
+    assert (found.ground[washed] == SET_ASIDE).mean() > 0.6
+
+
+def test_laid_down_ground_keeps_its_place():
+    other, yaw = relief(), np.deg2rad(4.0)
+    east, north = places(other)
+    ground = np.where((np.abs(east - 2.0) < 1.2) & (np.abs(north + 1.5) < 0.8), SET_ASIDE, STABLE)
+    c, s = np.cos(yaw), np.sin(yaw)
+    turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    move = Transform(turn, 1.0, [0.4, -0.3, 0.0])
+    seen = np.abs(east) < 5.0
+    target = dataclasses.replace(other, height=np.where(seen, other.height, np.nan), valid=seen)
+    laid = stable_ground(ground.astype(np.uint8), other.grid, move, target)
+    # every laid cell by hand: back where it came from
+    e, n = east - 0.4, north + 0.3
+    e, n = c * e + s * n, c * n - s * e
+    from_east, from_north = np.abs(e - 2.0), np.abs(n + 1.5)
+    assert (laid[seen & (from_east < 1.1) & (from_north < 0.7)] == SET_ASIDE).all()
+    beyond = (from_east > 1.3) | (from_north > 0.9)
+    inside = seen & (np.abs(e) < 6.9) & (np.abs(n) < 6.9)
+    assert (laid[inside & beyond] == STABLE).all()
+    assert not laid[~seen].any()
+    assert not laid[seen & (np.abs(n) > 7.1)].any()
 
 
 def test_slow_bending_is_averaged_over_all_ground():

@@ -11,7 +11,7 @@ import seafloor
 
 from meshreg import Mesh, PointCloud, Settings, Survey, apply_transform, register_pair
 from meshreg.errors import UsageError
-from meshreg.heights import rotation
+from meshreg.heights import STABLE, rotation
 from meshreg.statistics import registration_sigma
 from meshreg.types import Transform
 
@@ -116,6 +116,15 @@ def test_surfaces_polish_a_registration():
     assert found.verdict == "accepted", found.reason
     assert any("surfaces" in note for note in found.notes)
     assert errors(found, truth, moving.centre).max() < 0.003
+    # never surer than without, and what is stated is what the covariance says there
+    plain = register_pair(reference, moving, QUICK)
+    stated, before = (
+        np.array([r.registration_error[axis] for axis in "xyz"]) for r in (found, plain)
+    )
+    assert (stated > before).all()
+    assert (stated < before + 0.003).all()
+    at = registration_sigma(found, *found.registration_error["at"])
+    np.testing.assert_allclose(stated, at, rtol=1e-9)
     with pytest.raises(UsageError, match="'icp'"):
         register_pair(reference, moving, QUICK.changed({"refine.surfaces": "icp"}))
 
@@ -154,6 +163,12 @@ def test_evidence_for_the_report_is_on_common_grids():
     # after registration the heights agree to what changed; before, to the relief
     pair = evidence["reference_dem"], evidence["moving_dem"], evidence["moving_dem_before"]
     both = pair[0].valid & pair[1].valid
+    # nothing of the registered survey is cut off: OFFSET carries it beyond what was delivered
+    assert pair[1].valid.sum() == pytest.approx(pair[2].valid.sum(), rel=0.01)
+    # a fifth of the bumps changed; of the rest most ground is stable, and all of it is seen by both
+    stable = evidence["stable"] == STABLE
+    assert 0.5 < (stable & both).sum() / both.sum() < 1
+    assert (stable & ~both).sum() < 0.02 * both.sum()
     after = pair[0].height + pair[0].datum - pair[1].height - pair[1].datum
     assert abs(np.median(after[both])) < 0.005
     assert np.percentile(np.abs(after[both]), 50) < 0.02

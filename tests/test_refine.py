@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from pathlib import Path
 
@@ -9,7 +10,8 @@ import numpy as np
 import pytest
 import seafloor
 
-from meshreg.refine import fit, refine
+from meshreg.kriging import Ground
+from meshreg.refine import MISFIT, Refined, fit, refine, with_scale
 from meshreg.tiles import TileOffsets
 from meshreg.types import Grid, SurveyRaster
 
@@ -93,7 +95,7 @@ def test_fit_ignores_wild_tiles():
     offsets += rng.normal(0, 0.004, offsets.shape)
     offsets[::5] += rng.uniform(0.2, 0.5, (8, 2))
     tiles = TileOffsets(places, offsets, np.arange(40), np.zeros(40, int))
-    result = fit(tiles, pivot, yaw_free=True)
+    result = fit(tiles, pivot)
     assert result.yaw == pytest.approx(0.006, abs=4e-4)
     np.testing.assert_allclose(result.offset, [0.3, -0.2], atol=0.004)
     assert (result.weights[::5] == 0).all()
@@ -114,11 +116,77 @@ def test_covariance_is_the_scatter():
             np.tile(np.arange(36), 2),
             np.repeat([0, 1], 36),
         )
-        result = fit(both, pivot, yaw_free=True)
+        result = fit(both, pivot)
         answers.append([*result.offset, result.yaw])
         stated.append(np.diag(result.covariance))
     scatter, mean = np.var(np.array(answers), axis=0), np.mean(np.array(stated), axis=0)
     assert np.all((mean / scatter > 0.6) & (mean / scatter < 1.5))
+
+
+def lattice(count, low, high):
+    side = np.linspace(low, high, count)
+    return np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
+
+
+def tiles_of_a_similarity(seed, scale, yaw, warp, noise=0.003):
+    """Offsets of 7 × 7 tiles, 2 m apart, on ground that is scaled, turned and bent in waves.
+
+    Also the ground, and the scale of the similarity that fits all of it best.
+    """
+    rng = np.random.default_rng(seed)
+    places, ground = lattice(7, 0.0, 12.0), lattice(15, -0.5, 12.5)
+    pivot = ground.mean(axis=0)
+    waves = [
+        (2 * np.pi / rng.uniform(3, 12) * np.array([np.cos(a), np.sin(a)]), p, rng.normal(0, 1, 2))
+        for a, p in rng.uniform(0, 2 * np.pi, (12, 2))
+    ]
+    c, s = scale * np.cos(yaw), scale * np.sin(yaw)
+
+    def offset(at):
+        bent = sum(size * np.sin(at @ k + phase)[:, None] for k, phase, size in waves)
+        plain = (at - pivot) @ (np.array([[c, -s], [s, c]]) - np.eye(2)).T + (0.3, -0.2)
+        return plain + warp * bent / np.sqrt(6)
+
+    arm, there = ground - pivot, ground + offset(ground)
+    there = there - there.mean(axis=0)
+    along = (arm * there).sum()
+    across = (arm[:, 0] * there[:, 1] - arm[:, 1] * there[:, 0]).sum()
+    best = np.hypot(along, across) / (arm**2).sum()
+    offsets = offset(places) + rng.normal(0, noise, places.shape)
+    tiles = TileOffsets(places, offsets, np.arange(49), np.zeros(49, int))
+    refined = Refined(pivot, np.array([0.3, -0.2]), yaw, np.eye(3) * 1e-6, tiles)
+    return refined, Ground(ground, np.full(len(ground), 1 / len(ground))), best
+
+
+@pytest.mark.parametrize(
+    ("scale", "yaw", "warp"), [(0.97, 0.012, 0.0), (1.02, -0.015, 0.0), (1.02, 0.0, 0.02)]
+)
+def test_scale_and_its_variance(scale, yaw, warp):
+    """Over many draws the scale scatters about the truth by what is stated, `MISFIT` apart.
+
+    Waves are smoother than the random field that the warp is taken for: there it says too much.
+    """
+    error, variance = [], []
+    for seed in range(20):
+        refined, ground, best = tiles_of_a_similarity(seed, scale, yaw, warp)
+        if warp == 0:
+            assert best == pytest.approx(scale, abs=1e-12)
+        answer, found = with_scale(refined, ground)
+        error.append(found - best)
+        variance.append(answer.scale_variance)
+    error, variance = np.array(error), np.array(variance)
+    assert np.abs(error).max() < (0.0004 if warp == 0 else 0.002)
+    ratio = variance.mean() / (error**2).mean() / MISFIT
+    assert 0.6 < ratio < (1.9 if warp == 0 else 10.0)
+    assert (error**2 < 9 * variance).all()
+
+
+def test_scale_of_few_tiles_is_not_known():
+    whole, ground, _ = tiles_of_a_similarity(0, 1.02, 0.0, 0.0)
+    few = dataclasses.replace(whole, tiles=whole.tiles.only(np.arange(49) < 11))
+    refined, scale = with_scale(few, ground)
+    assert scale == 1.0
+    assert np.sqrt(refined.scale_variance) == pytest.approx(0.0033, abs=1e-4)
 
 
 def test_too_few_tiles_keep_the_judged_offset():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import dataclasses
+import functools
 import hashlib
 import io
 import json
@@ -17,9 +18,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
-from made_registration import OFFSET, made_registration, relief
+from made_registration import EAST, NORTH, OFFSET, ground, made_registration, relief
 from PIL import Image
 
 from meshreg import cli
@@ -27,9 +28,21 @@ from meshreg.cli_parts.reporting import add_report, keep_evidence, write_report
 from meshreg.errors import InputError, OutputError, ResourceLimitError, UsageError
 from meshreg.io.evidence import NAME, read_evidence, write_evidence
 from meshreg.io.record import read_registration, write_registration
-from meshreg.report import charts, frame, keep, keeping, pictures, view, words
+from meshreg.report import (
+    Result,
+    answer,
+    charts,
+    findings,
+    frame,
+    keep,
+    keeping,
+    pictures,
+    stated,
+    view,
+    words,
+)
 from meshreg.report.markup import json_block, number
-from meshreg.types import Grid, Registration, SurveyRaster
+from meshreg.types import Grid, Registration, SurveyRaster, Transform
 
 VERDICTS = ("accepted", "review", "rejected")
 HOSTILE = "</script><img src=x onerror=alert(1)>\"'&[red]"
@@ -136,8 +149,9 @@ def test_every_picture_decodes_and_is_small_enough(results: dict[str, Path], ver
     page = page_of(results[verdict])
     shown = [a["src"] or "" for t, a in page.elements if t == "img"]
     shown += [a["href"] or "" for t, a in page.elements if t == "image"]
-    # mosaics and reliefs of each stage, overlays, differences, thumbnails and score surfaces
-    assert len(shown) == {"accepted": 14, "review": 14, "rejected": 9}[verdict]
+    # mosaics and reliefs of each stage, overlays, differences, thumbnails, the stable ground,
+    # score surfaces and their peaks
+    assert len(shown) == {"accepted": 18, "review": 18, "rejected": 11}[verdict]
     for uri in shown:
         data = base64.b64decode(uri.removeprefix("data:image/webp;base64,"), validate=True)
         with Image.open(io.BytesIO(data)) as image:
@@ -147,15 +161,59 @@ def test_every_picture_decodes_and_is_small_enough(results: dict[str, Path], ver
 
 
 def test_the_budget_of_a_page_holds_at_its_worst() -> None:
-    small = 4  # two mosaics, the relief and one for each score surface
+    small = 5  # two mosaics, the relief (drawn three times), the ground
+    surfaces = 3 * 1.5  # each whole, and half as much around its peak
     raw = (
         3 * keeping.ORTHO + 3 * keeping.RELIEF + 2 * keeping.TONE + keeping.DIFFERENCE
-        + (small + 2) * keeping.SMALL + 160_000 + 3 * 2 * keeping.HEIGHT_SIDE**2
+        + (small + 2 + surfaces) * keeping.SMALL + 160_000 + 3 * 2 * keeping.HEIGHT_SIDE**2
     )  # fmt: skip
     assert raw * 4 / 3 + 250_000 < 8e6
 
 
 # ---- what it says -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("value", "said"),
+    [
+        (0.9871, "98.7%"), (0.5, "50.0%"), (0.9999, "over 99.9%"), (1.0, "over 99.9%"),
+        (0.0, "under 0.1%"), (None, None), (math.nan, None),
+    ],
+)  # fmt: skip
+def test_probability_is_said_with_where_it_comes_from(
+    value: float | None, said: str | None
+) -> None:
+    registration = dataclasses.replace(made_registration("accepted"), probability=value)
+    assert words.probability(registration) == said
+    top = Page(answer.verdict(Result(registration, {}))).text
+    assert ("calibrated on synthetic pairs" in top) == (said is not None)
+    assert said is None or said in top
+    paragraph = words.methods_paragraph(registration)
+    assert ("calibrated on synthetic pairs" in paragraph) == (said is not None)
+
+
+def test_what_the_bending_leaves_is_said_beside_the_sigmas() -> None:
+    parts = {
+        "horizontal": {"held_out_rigid": 0.0766, "held_out": 0.0123},
+        "vertical": {"held_out_rigid": 0.0296, "held_out": 0.0045},
+    }
+    for applied, numbers, words_said in (
+        (False, ("0.077 m", "0.030 m up"), "not in ±"),
+        (True, ("0.012 m", "0.004 m up"), "after the warp"),
+    ):
+        internal = {"said": "x", "applied": applied, **parts}
+        registration = dataclasses.replace(made_registration("accepted"), internal=internal)
+        top = Page(answer.verdict(Result(registration, {}))).text
+        assert all(number in top for number in (*numbers, words_said))
+        kept = {name: value for name, value in keep(registration).items() if name != "meta"}
+        meta = json.loads(bytes(keep(registration)["meta"]))
+        left = Page(findings.left_over(Result(registration, {**kept, "meta": meta}))).text
+        assert ("before the warp" in left) == applied
+        assert ("The registered survey is warped" in left) == applied
+    assert (
+        "Left in the tiles"
+        not in Page(answer.verdict(Result(made_registration("accepted"), {}))).text
+    )
 
 
 def test_accepted_page_says_the_answer(results: dict[str, Path]) -> None:
@@ -492,6 +550,101 @@ def test_written_evidence_reads_back(tmp_path: Path) -> None:
     for name, array in kept.items():
         np.testing.assert_array_equal(read[name], array)
     assert [path.name for path in tmp_path.iterdir()] == [NAME]
+
+
+def _colors(picture: Any) -> np.ndarray:
+    with Image.open(io.BytesIO(bytes(picture))) as image:
+        return np.asarray(image.convert("RGBA"), int)
+
+
+def test_stable_ground_is_kept_cell_by_cell(results: dict[str, Path]) -> None:
+    kept = read_evidence(results["accepted"])
+    state, about = ground(), kept["meta"]["ground"]
+    for name, value in (("changed", 1), ("set_aside", 2), ("stable", 3)):
+        assert about[name] == pytest.approx((state == value).sum() / (state > 0).sum())
+    assert about["bounds"] == kept["meta"]["dem"]["bounds"]
+    color = _colors(kept["ground"])
+    assert color.shape[:2] == state.shape
+    assert ((color[..., 3] > 128) == (state > 0)).all()
+    seen = {tuple(color[state == value][0, :3]) for value in (1, 2, 3)}
+    assert len(seen) == 3
+    for value in (1, 2, 3):
+        assert (color[state == value] == color[state == value][0]).all()
+    assert "ground" not in read_evidence(results["rejected"])
+    text = page_of(results["accepted"]).text
+    for share in (about["stable"], about["changed"], about["set_aside"]):
+        assert f": {share:.0%}" in text
+
+
+def test_the_picture_around_a_peak_has_it_where_its_bounds_say(results: dict[str, Path]) -> None:
+    kept = read_evidence(results["accepted"])
+    west, south, east, north = kept["meta"]["surfaces"]["terrain"]["near"]
+    color = _colors(kept["near_terrain"])
+    rows, cols = color.shape[:2]
+    assert (east - west) / cols == pytest.approx(0.1)
+    assert (north - south) / rows == pytest.approx(0.1)
+    row, col = np.unravel_index(np.argmax(color[..., 0]), (rows, cols))  # the brightest is yellow
+    found = west + (col + 0.5) * (east - west) / cols, north - (row + 0.5) * (north - south) / rows
+    assert found == pytest.approx(tuple(OFFSET[:2]), abs=0.16)
+
+
+def turned(degrees: float) -> Transform:
+    """Turn the made moving survey about its centre, as the search does before it looks."""
+    c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+    rotation = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    return Transform(rotation, 1.0, np.zeros(3), np.array([EAST + 12, NORTH + 13, -12.5]))
+
+
+def test_matches_of_a_turned_survey_end_in_the_delivered_one() -> None:
+    registration = made_registration("accepted")
+    sift = registration.estimates[0]
+    truth = np.array(sift.evidence["moving_points"])
+    level = np.full((len(truth), 1), -3.0)  # a turn about the vertical asks for no height
+    motion = turned(7.0)
+    seen = {**sift.evidence, "moving_points": motion.apply(np.hstack([truth, level]))[:, :2]}
+    moved = dataclasses.replace(sift, evidence=seen)
+    kept = keep(
+        dataclasses.replace(
+            registration,
+            estimates=(moved,),
+            evidence={**registration.evidence, "motion": motion},
+        )
+    )
+    assert json.loads(bytes(kept["meta"]))["turned"]["yaw_degrees"] == pytest.approx(7.0)
+    order = np.r_[70:180, 0:70]  # outliers first, so that inliers are drawn over them
+    assert np.abs(kept["matches"][:, 2:4] - truth[order]).max() < 1e-8
+    unturned = keep(dataclasses.replace(registration, estimates=(moved,)))
+    assert np.abs(unturned["matches"][:, 2:4] - truth[order]).max() > 0.5
+
+
+@functools.cache
+def bare() -> Registration:
+    return dataclasses.replace(made_registration("accepted"), evidence={})
+
+
+@settings(deadline=None)  # the first example makes the registration
+@given(st.floats(-9, 9), st.floats(-30, 30), st.floats(-30, 30))
+def test_the_result_is_stated_as_a_method_would(degrees: float, east: float, north: float) -> None:
+    registration, motion = bare(), turned(degrees)
+    place = np.array([EAST + 12 + east, NORTH + 13 + north, -12.5])
+    error = {"x": 0.1, "y": 0.1, "z": 0.1, "isotropic": 0.1, "at": place.tolist()}
+    stated_there = dataclasses.replace(
+        registration, registration_error=error, evidence={"motion": motion}
+    )
+    answer = stated.among_methods(stated_there)
+    assert answer is not None
+    assert registration.transform is not None
+    back = np.linalg.inv(registration.transform.matrix) @ np.append(place, 1.0)
+    start = motion.matrix @ back
+    assert answer[0] == pytest.approx((place - start[:3])[:2], abs=1e-6)
+    # the variance of the place under draws of the record's covariance, to first order
+    assert registration.covariance is not None
+    root = np.linalg.cholesky(registration.covariance[np.ix_([0, 1, 5], [0, 1, 5])])
+    home = registration.transform.pivot + registration.transform.offset
+    arm = (place - home)[:2]
+    steps = [column[:2] + column[2] * np.array([-arm[1], arm[0]]) for column in root.T]
+    expected = sum(np.outer(step, step) for step in steps)
+    np.testing.assert_allclose(answer[1], expected, rtol=1e-9, atol=1e-15)
 
 
 # ---- charts -----------------------------------------------------------------------------------

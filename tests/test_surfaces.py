@@ -16,6 +16,12 @@ from meshreg.types import Grid, Transform
 SIGMA = {"x": 0.004, "y": 0.004, "z": 0.004}
 
 
+def everywhere(east=0.0, north=0.0, half=3.0):
+    """Stable ground all round a place."""
+    grid = Grid(east - half, north + half, 0.1, (round(20 * half), round(20 * half)))
+    return np.ones(grid.shape, bool), grid
+
+
 def ball(centre, radius, n=24):
     """Return vertices and faces of a sphere; its lower half no DEM can see."""
     polar, around = np.linspace(0, np.pi, n), np.linspace(0, 2 * np.pi, 2 * n, endpoint=False)
@@ -70,7 +76,8 @@ def test_a_small_motion_is_taken_back(kind):
     far = Transform(offset=(731_000.0, 5_705_000.0, -12.0))  # at UTM size, where float32 is blind
     reference = apply_transform(reef(seed=1, kind=kind), far)
     moving = apply_transform(reef(seed=2, kind=kind), far @ truth.inverse())
-    found = polish(reference, moving, Transform(), far.offset, SIGMA, max_points=25_000)
+    stable = everywhere(*far.offset[:2])
+    found = polish(reference, moving, Transform(), far.offset, SIGMA, stable, max_points=25_000)
     assert found.accepted, found.note
     assert found.after < found.before
     assert found.moved == pytest.approx(np.linalg.norm(truth.offset), abs=0.002)
@@ -79,19 +86,60 @@ def test_a_small_motion_is_taken_back(kind):
     error = np.linalg.norm(found.transform.apply(corners) - want, axis=1)
     assert error.max() < 0.002
     assert np.linalg.norm(corners - want, axis=1).max() > 0.009
+    # the step is what was taken back, and counts as doubt: never surer than before
+    before = np.diag([*3 * [0.004**2], *3 * [1e-6], 0.0])
+    after = found.widened(before)
+    np.testing.assert_allclose(found.step[:3], truth.offset, atol=0.002)
+    np.testing.assert_allclose(found.step[3:], np.deg2rad([0.1, 0.0, 0.1]), atol=3e-4)
+    assert np.linalg.eigvalsh(after - before).min() > -1e-15
+    assert np.sqrt(np.diag(after - before)[:3]) == pytest.approx(np.abs(found.step[:3]), abs=0.001)
+    assert 0 < np.sqrt(found.scatter[:3, :3].diagonal()).max() < 0.001
 
 
 @pytest.mark.needs("open3d")
 def test_surfaces_that_lie_right_already_stay():
-    found = polish(reef(1), reef(2), Transform(), np.zeros(3), SIGMA, max_points=25_000)
+    stable = everywhere()
+    found = polish(reef(1), reef(2), Transform(), np.zeros(3), SIGMA, stable, max_points=25_000)
     assert np.linalg.norm(found.transform.apply(np.zeros(3))) < 0.001
+
+
+@pytest.mark.needs("open3d")
+def test_ground_that_changed_is_not_looked_at():
+    """Half of the moving reef slid by 2 cm: told so, the polish stays with the other half."""
+    reference, moving = reef(1), reef(2)
+    points = moving.geometry.vertices.copy()
+    points[points[:, 0] > 0] += (0.0, 0.02, 0.01)
+    slid = Survey("slid", Mesh(points, moving.geometry.faces))
+    known, grid = everywhere()
+    _, east = np.meshgrid(*(np.arange(n) for n in grid.shape), indexing="ij")
+    half = known & (grid.west + (east + 0.5) * grid.cell < -0.05)
+    told, untold = (
+        polish(reference, slid, Transform(), np.zeros(3), SIGMA, (stable, grid), max_points=25_000)
+        for stable in (half, known)
+    )
+    place = np.array([[-0.6, 0.0, 0.0]])
+    errors = [np.linalg.norm(f.transform.apply(place) - place) for f in (told, untold)]
+    assert errors[0] < 0.0015
+    assert errors[1] > 3 * errors[0]
+
+
+@pytest.mark.needs("open3d")
+def test_without_stable_ground_nothing_is_polished():
+    start = Transform(offset=(0.01, 0.0, 0.0))
+    none = np.zeros_like(everywhere()[0]), everywhere()[1]
+    for stable, why in ((None, "too little stable ground"), (none, "too few points")):
+        found = polish(reef(1), reef(2), start, np.zeros(3), SIGMA, stable, max_points=25_000)
+        assert found.transform is start
+        assert why in found.note
 
 
 @pytest.mark.needs("open3d")
 def test_another_reef_is_left_alone():
     start = Transform(offset=(0.01, 0.02, 0.0))
-    found = polish(reef(place=0), reef(place=7), start, np.zeros(3), SIGMA, max_points=25_000)
+    pair, stable = (reef(place=0), reef(place=7)), everywhere()
+    found = polish(*pair, start, np.zeros(3), SIGMA, stable, max_points=25_000)
     assert not found.accepted
+    assert (found.widened(np.eye(7)) == np.eye(7)).all()
     assert found.transform is start
     assert found.note
 
@@ -99,7 +147,7 @@ def test_another_reef_is_left_alone():
 @pytest.mark.needs("open3d")
 def test_surveys_without_points_in_common_are_left_alone():
     start = Transform(offset=(50.0, 0.0, 0.0))
-    found = polish(reef(), reef(seed=1), start, np.zeros(3), SIGMA)
+    found = polish(reef(), reef(seed=1), start, np.zeros(3), SIGMA, everywhere(50.0))
     assert found.transform is start
     assert "too few points" in found.note
 
@@ -107,7 +155,7 @@ def test_surveys_without_points_in_common_are_left_alone():
 def test_maps_have_no_surface():
     height = np.zeros((4, 4), np.float32)
     maps = Survey("maps", Maps(height, Grid(0.0, 4.0, 1.0, (4, 4))))
-    found = polish(maps, maps, Transform(), np.zeros(3), SIGMA)
+    found = polish(maps, maps, Transform(), np.zeros(3), SIGMA, None)
     assert not found.accepted
     assert "maps" in found.note
 
@@ -116,7 +164,7 @@ def test_without_open3d_the_remedy_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "open3d", None)
     cloud = Survey("cloud", PointCloud(np.random.default_rng(0).random((10, 3))))
     with pytest.raises(UsageError, match="meshreg doctor"):
-        polish(cloud, cloud, Transform(), np.zeros(3), SIGMA)
+        polish(cloud, cloud, Transform(), np.zeros(3), SIGMA, None)
 
 
 def test_unknown_surfaces_are_a_misuse():

@@ -8,10 +8,14 @@ import numpy as np
 import pytest
 import seafloor
 
-from meshreg.tiles import Overlap, correlated_tiles, polished_tiles
+from meshreg.tiles import Overlap, Relief, correlated_tiles, polished_tiles
 from meshreg.types import Grid
 
 CELL = 0.1
+
+
+def polished(reference, moving, offset=(0.0, 0.0), guess=np.zeros_like):
+    return polished_tiles(Relief.of(reference), Relief.of(moving), np.array(offset), guess)
 
 
 @pytest.mark.parametrize("tenths", [(0, 0), (1, 9), (3, -4), (5, 5), (-7, 2), (9, -9)])
@@ -21,7 +25,7 @@ def test_tenths_of_a_cell(tenths):
     floor = seafloor.Seafloor.random(3, size=16.0)
     reference = floor.raster(CELL, 5.0, noise=0.0)
     moving = floor.moved(-east, -north).raster(CELL, 5.0, noise=0.0, up=0.2)
-    found = polished_tiles(reference, moving, np.zeros(2), np.zeros_like)
+    found = polished(reference, moving)
     error = np.abs(found.offsets - (east, north))
     assert error.max() < 0.033 * CELL
     assert np.median(error) < 0.005 * CELL
@@ -29,7 +33,7 @@ def test_tenths_of_a_cell(tenths):
 
 def test_a_survey_onto_itself_does_not_move_at_all():
     reference = seafloor.Seafloor.random(3, size=16.0).raster(CELL, 5.0)
-    found = polished_tiles(reference, reference, np.zeros(2), np.zeros_like)
+    found = polished(reference, reference)
     assert np.abs(found.offsets).max() < 1e-9
 
 
@@ -39,9 +43,7 @@ def test_heights_biased_in_proportion_to_themselves_do_not_drift():
     reference = floor.raster(CELL, 5.0, noise=0.0)
     moving = floor.moved(-0.03, 0.04).raster(CELL, 5.0, noise=0.0)
     stretched = dataclasses.replace(moving, height=1.01 * moving.height)
-    plain, biased = (
-        polished_tiles(reference, m, np.zeros(2), np.zeros_like) for m in (moving, stretched)
-    )
+    plain, biased = (polished(reference, m) for m in (moving, stretched))
     assert np.abs(biased.offsets.mean(axis=0) - plain.offsets.mean(axis=0)).max() < 0.002 * CELL
 
 
@@ -53,9 +55,7 @@ def test_disturbed_starts_end_at_one_answer():
     for start in ((0.0, 0.0), (0.08, -0.05), (-0.06, 0.07)):
         answer = np.array(start)
         for _ in range(4):
-            found = polished_tiles(
-                reference, moving, answer, lambda places, a=answer: a + 0 * places
-            )
+            found = polished(reference, moving, answer, lambda places, a=answer: a + 0 * places)
             answer = np.median(found.offsets, axis=0)
         answers.append(answer)
     assert np.ptp(answers, axis=0).max() < 0.02 * CELL
@@ -91,6 +91,6 @@ def test_tiles_without_ground_are_left_out():
     moving = dataclasses.replace(
         reference, height=np.where(hole, reference.height, np.nan), valid=hole
     )
-    found = polished_tiles(reference, moving, np.zeros(2), np.zeros_like)
+    found = polished(reference, moving)
     assert (found.places[:, 0] > -0.5).all()
     assert len(found.places) >= 12

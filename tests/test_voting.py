@@ -17,6 +17,7 @@ from meshreg.benchmark.measure import register_rasters
 from meshreg.judge import judge
 from meshreg.raster.grid import coarsened
 from meshreg.settings import SearchSettings
+from meshreg.statistics import registration_sigma
 from meshreg.tile_surfaces import channel_surfaces
 from meshreg.types import Transform
 from meshreg.voting import STANDS_OUT, similarity, vote
@@ -163,6 +164,7 @@ def test_any_heading_is_recovered(yaw_deg):
     found = register_pair(survey(21), moving, QUICK)
     assert found.verdict == "accepted", found.reason
     assert found.transform.scale == 1.0
+    assert not found.covariance[6].any()
     assert abs(yaw_of(found.transform) - yaw_deg) < 0.02
     error = found.transform.apply(place(moving)) - truth.apply(place(moving))
     assert np.abs(error).max() < 0.01
@@ -187,6 +189,7 @@ def test_a_wrong_scale_is_named_and_mended(scale):
     assert f"{percent:.1f} % too {'small' if scale > 1 else 'large'}" in found.reason
     assert "check the scale bars" in found.reason
     assert found.transform.scale == pytest.approx(scale, abs=5e-4)
+    assert found.covariance[6, 6] > 0
     error = found.transform.apply(place(moving)) - truth.apply(place(moving))
     assert np.abs(error)[:2].max() < 0.01
 
@@ -195,7 +198,16 @@ def test_a_scale_that_was_asked_for_may_be_accepted():
     moving, _ = displaced(survey(21, 0.1), 0.0, 1.02)
     found = register_pair(survey(21), moving, QUICK.changed({"search.free_scale": True}))
     assert found.verdict == "accepted", found.reason
-    assert found.transform.scale == pytest.approx(1.02, abs=5e-4)
+    sigma = np.sqrt(found.covariance[6, 6])
+    assert 2e-6 < sigma < 2.5e-4
+    assert abs(found.transform.scale - 1.02) < 3 * sigma
+    # the doubt of the scale is no doubt of the place, but of what lies away from it
+    assert np.abs(found.covariance[6, :6]).max() < 0.3 * sigma * np.sqrt(found.covariance[0, 0])
+    home = found.transform.pivot + found.transform.offset
+    near, far = (
+        registration_sigma(found, home[0] + east, home[1], home[2])[0] for east in (0.0, 500.0)
+    )
+    assert far**2 - near**2 == pytest.approx((500 * sigma) ** 2, rel=0.02)
 
 
 @pytest.mark.parametrize("seed", range(4))

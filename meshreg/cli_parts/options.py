@@ -5,11 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from enum import StrEnum
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from meshreg.errors import UsageError
 from meshreg.io.options import ReadOptions
 from meshreg.settings import Settings, read_settings
+
+if TYPE_CHECKING:
+    from meshreg.cli_parts.common import SurveyRequest
 
 
 def join_settings(
@@ -41,6 +44,36 @@ def read_options(shift: str | None, name: str, **said: Any) -> ReadOptions:
         key: str(value) if isinstance(value, StrEnum) else value for key, value in said.items()
     }
     return ReadOptions(shift=None if shift is None else _triple(shift, name), **plain)
+
+
+def survey_request(path: str, shift: str | None, **said: Any) -> SurveyRequest:
+    """Return a command's only survey."""
+    from meshreg.cli_parts.common import SurveyRequest
+
+    return SurveyRequest(path, read_options(shift, "--shift", **said))
+
+
+def survey_requests(
+    paths: tuple[str, str],
+    shifts: tuple[str | None, str | None],
+    scale: Sequence[float] | None,
+    positions: Sequence[Path] | None,
+    **said: Any,
+) -> tuple[SurveyRequest, SurveyRequest]:
+    """Return the reference and the moving survey; what is `said` holds for both."""
+    from meshreg.cli_parts.common import SurveyRequest
+
+    scales, places = for_both("--scale", scale), for_both("--positions", positions)
+    reference, moving = (
+        SurveyRequest(
+            paths[k],
+            read_options(
+                shifts[k], f"--{which}-shift", **said, scale=scales[k], positions=places[k]
+            ),
+        )
+        for k, which in enumerate(("reference", "moving"))
+    )
+    return reference, moving
 
 
 def _triple(text: str, name: str) -> tuple[float, float, float]:

@@ -155,11 +155,11 @@ def _announce(url: str, request: PickRequest, voice: Voice) -> None:
 
 
 def _say_end(desk: Desk, voice: Voice) -> None:
-    from meshreg.ties.hand import hand_registration
+    from meshreg.ties.hand import free_hand
 
     ties = desk.session.ties
     voice.say(f"\n{len(ties.complete)} pairs are in {escape(str(desk.session.path))}.")
-    hand = hand_registration(ties, desk.settings)
+    hand, _ = free_hand(ties, desk.settings)
     if hand is not None:
         voice.say(
             f"Hand registration: {hand.east:+.3f} m east, {hand.north:+.3f} m north; "

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -108,10 +109,12 @@ def register_into(folder: Path, request: RegisterRequest, progress: Progress) ->
     )
     _log_result(registration)
     progress("write", 0.0)
-    write_record_files(registration, folder, reference=reference, moving=moving)
-    progress("figures", 0.0)
-    draw_figures(registration, folder / "figures")
-    add_report(registration, folder)
+    with ThreadPoolExecutor(1) as beside:  # a failure of either ends the job, and the folder
+        figures = beside.submit(draw_figures, registration, folder / "figures")
+        write_record_files(registration, folder, reference=reference, moving=moving)
+        add_report(registration, folder)
+        progress("figures", 0.0)
+        figures.result()
     progress("figures", 1.0)
     return registration
 

@@ -12,13 +12,14 @@ import numpy as np
 from rich.markup import escape
 from rich.table import Table
 
+from meshreg.cli_parts.common import LOG
 from meshreg.cli_parts.console import Voice
-from meshreg.errors import UsageError
+from meshreg.errors import InputError, UsageError
 
 if TYPE_CHECKING:
     from meshreg.pipeline import Manual
     from meshreg.settings import Settings
-    from meshreg.ties.formats import Context, ToMetres
+    from meshreg.ties.foreign import Context, ToMetres
     from meshreg.ties.placing import Placing
     from meshreg.ties.records import TiePoints
     from meshreg.types import Float64, OffsetEstimate, Registration, Survey, Transform
@@ -39,10 +40,10 @@ class ValidateRequest:
 
 
 def validate(request: ValidateRequest) -> dict[str, Any]:
-    """Compare, write validation.json, .html and the figure into OUT, return the document."""
+    """Compare, write validation.json, .html and figures into OUT, say so in its report.html."""
     from meshreg.io.document import read_registration, to_json
     from meshreg.ties.figure import draw_validation
-    from meshreg.ties.page import validation_page
+    from meshreg.ties.page import sentence, validation_page
     from meshreg.ties.placing import read_placing
     from meshreg.ties.validate import validate as compare
 
@@ -63,8 +64,9 @@ def validate(request: ValidateRequest) -> dict[str, Any]:
         seed=request.seed,
         overlap=_overlap(request.out),
         about=about,
+        turned=_turned(request.out),
     )
-    document = dict(validation.document)
+    document = {**validation.document, "said": sentence(validation.document)}
     drawn = {name: _png(figure) for name, figure in draw_validation(validation).items()}
     names = tuple(
         str(getattr(registration, which).get("name") or which) for which in ("reference", "moving")
@@ -74,6 +76,7 @@ def validate(request: ValidateRequest) -> dict[str, Any]:
         _write(request.out / "figures" / f"{name}.png", picture)
     _write(request.out / "validation.html", page.encode("utf-8"))
     _write(request.out / "validation.json", to_json(document).encode("utf-8"))
+    remake_report(request.out)
     return document
 
 
@@ -109,10 +112,13 @@ def read_manual(
     if ties is None:
         return None, []
     from meshreg.ties import ties_estimate
-    from meshreg.ties.formats import Context, read_points
+    from meshreg.ties.foreign import Context
+    from meshreg.ties.formats import read_points
+    from meshreg.ties.validate import require_inside
 
     points = read_points(ties, Context(reference.crs))
     _require_crs(ties, points, reference.crs)
+    require_inside("reference", reference.bounds, points.arrays()[0])
     about = about_files(ties)
     said = f"{len(points.complete)} tie points were picked by hand ({', '.join(about['files'])}"
 
@@ -134,7 +140,7 @@ def _require_crs(ties: str, points: TiePoints, crs: str | None) -> None:
 def _context(
     request: ValidateRequest, registration: Registration, placing: Placing | None
 ) -> Context:
-    from meshreg.ties.formats import Context
+    from meshreg.ties.foreign import Context
 
     pixels = {}
     for side, said in (("reference", request.reference_ortho), ("moving", request.moving_ortho)):
@@ -164,6 +170,18 @@ def _pixels(path: Path) -> ToMetres:
     return to_metres
 
 
+def _turned(out: Path) -> tuple[float, float] | None:
+    """Degrees and scale by which the survey was turned before the methods looked at it."""
+    from meshreg.io.evidence import read_evidence
+
+    try:
+        turned = read_evidence(out).get("meta", {}).get("turned")
+        return None if turned is None else (float(turned["yaw_degrees"]), float(turned["scale"]))
+    except (InputError, AttributeError, KeyError, TypeError, ValueError) as error:
+        LOG.warning("the evidence is not looked at: %s", error)
+        return None
+
+
 def _overlap(out: Path) -> Float64 | None:
     """Places that both pictures of the result show; None where it has none."""
     from meshreg.ties.tiles import TileSource, overlap_points
@@ -177,6 +195,17 @@ def _overlap(out: Path) -> Float64 | None:
     finally:
         reference.close()
         moving.close()
+
+
+def remake_report(out: Path) -> None:
+    """Make OUT/report.html again, so that it leads to the comparison; its failure loses nothing."""
+    from meshreg.cli_parts.reporting import write_report
+
+    try:
+        write_report(out)
+    except Exception as error:
+        LOG.warning("report.html was not made again: %s: %s", type(error).__name__, error)
+        LOG.debug("why", exc_info=True)
 
 
 def _png(figure: Any) -> bytes:
@@ -197,11 +226,10 @@ def _write(path: Path, data: bytes) -> None:
 def show(document: dict[str, Any], out: Path, voice: Voice) -> None:
     """Print the hand registration, and each answer's distance from it."""
     from meshreg.report.style import method_name
-    from meshreg.ties.page import sentence
 
     hand = document["hand"]
     word = "[bold green]CONFIRMED[/]" if document["confirmed"] else "[bold red]NOT CONFIRMED[/]"
-    voice.say(f"{word}: {escape(sentence(document))}")
+    voice.say(f"{word}: {escape(document['said'])}")
     voice.say(
         f"hand registration: {hand['east']:+.4f} m east, {hand['north']:+.4f} m north; "
         f"length {document['table_one']['offset']:.4f} m, mean residual {hand['residual']:.4f} m"
@@ -223,4 +251,7 @@ def show(document: dict[str, Any], out: Path, voice: Voice) -> None:
         voice.say(f"No pairs in the {', '.join(document['weak_spots'])}.")
     for note in document["ties"]["notes"]:
         voice.say(f"[dim]note:[/] {escape(note)}")
-    voice.say(f"Written to [bold]{escape(str(out))}[/]: validation.json, validation.html")
+    voice.say(
+        f"Written to [bold]{escape(str(out))}[/]: validation.html, validation.json; "
+        "report.html leads there."
+    )

@@ -66,7 +66,7 @@ class Pages:
             document.fail(
                 "turns its texture (KHR_texture_transform), which is not read.",
                 place,
-                "Export it without that, or read it with geometry_only.",
+                "Export it without that, or read it with geometry_only (--geometry-only).",
             )
         offset = document.numbers(transform, "offset", 2, place)
         scale = document.numbers(transform, "scale", 2, place)

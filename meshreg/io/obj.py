@@ -141,7 +141,7 @@ def _require_range(
     named = f"{what} {corners[first] + 1}" if corners[first] >= 0 else f"a {what} before the first"
     remedy = "Export the file again"
     if what != "vertex":
-        remedy += ", or read it as geometry only, without texture"
+        remedy += ", or read it as geometry only (--geometry-only), without texture"
     raise InputError(
         f"a face refers to {named}, but the file has {count}.",
         file=path,

@@ -38,7 +38,7 @@ _COLORS = (
     ("r", "g", "b"),
 )
 _UV = (("s", "t"), ("u", "v"), ("texture_u", "texture_v"), ("texture_s", "texture_t"))
-_WITHOUT = "Export it again, or read it with geometry_only to leave the textures out."
+_WITHOUT = "Export it again, or leave the textures out (geometry_only, --geometry-only)."
 
 
 def read(path: Path, options: ReadOptions) -> Survey:

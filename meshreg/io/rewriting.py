@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from meshreg.errors import InputError, OutputError, UsageError
 from meshreg.io.mover import Mover
 from meshreg.io.safe import copy_file, fingerprint
-from meshreg.types import Float64, SourceFile
+from meshreg.types import Float64, SourceFile, ends
 
 _LOG = logging.getLogger("meshreg")
 FINEST = 1e-4  # coarsest step of stored coordinates [m] that counts as lossless
@@ -95,10 +95,12 @@ class Extent:
     def add(self, points: NDArray[Any]) -> None:
         """Take in points (N, 3)."""
         self.count += len(points)
-        finite = np.asarray(points, np.float64)[np.isfinite(points).all(axis=1)]
+        finite = np.asarray(points, np.float64)
+        if not np.isfinite(finite).all():
+            finite = finite[np.isfinite(finite).all(axis=1)]
         if len(finite):
-            self.low = np.minimum(self.low, finite.min(axis=0))
-            self.high = np.maximum(self.high, finite.max(axis=0))
+            low, high = ends(finite)
+            self.low, self.high = np.minimum(self.low, low), np.maximum(self.high, high)
 
     def require_equal(self, points: NDArray[Any], path: Path, tolerance: float = 0.0) -> None:
         """Check points read back from `path`.

@@ -17,8 +17,16 @@ import numpy as np
 
 from meshreg.errors import UsageError
 from meshreg.offsets.correlate import Window
+from meshreg.offsets.sandwich import (
+    FLOOR,
+    correlated_blocks,
+    error_bar,
+    overlap_ground,
+    whole_shift,
+)
+from meshreg.offsets.surface import Peak
 from meshreg.settings import Settings
-from meshreg.types import OffsetEstimate, SurveyRaster
+from meshreg.types import Bool, Float64, OffsetEstimate, SurveyRaster
 
 log = logging.getLogger(__name__)
 Estimate = Callable[[SurveyRaster, SurveyRaster, Settings], OffsetEstimate]
@@ -153,13 +161,13 @@ def _exhaustive(
         return failed(method, "the surveys do not overlap within the search window")
     peak, score, evidence = scan(reference, moving, settings, window)
     evidence = dict(evidence) | {"east": window.east, "north": window.north}
-    counts = evidence.pop("counts")
+    counts, pairs = evidence.pop("counts"), evidence.pop("pairs")
     if peak is None:
         largest = int(counts.max()) if counts.size else 0
         why = "the surveys do not overlap" if largest < 100 else "the ground or image is flat"
         return failed(method, f"nothing to compare within the search window: {why}", evidence)
     evidence |= {"best": (peak.east, peak.north), "second": peak.second}
-    smaller = min(counts.max(), _cells(reference, method), _cells(moving, method))
+    smaller = min(counts.max(), *(int(_mask(r, method).sum()) for r in (reference, moving)))
     overlap = float(counts[peak.index]) / max(float(smaller), 1.0)
     if peak.border:
         reach = float(window.east[-1])
@@ -175,7 +183,7 @@ def _exhaustive(
         f"the second peak is almost as good (gap {peak.gap:.2f})" if weak else "",
         peak.east,
         peak.north,
-        peak.sigma,
+        _sigma(reference, moving, (_mask(reference, method), _mask(moving, method)), peak, pairs),
         score,
         peak.gap,
         min(overlap, 1.0),
@@ -183,9 +191,26 @@ def _exhaustive(
     )
 
 
-def _cells(raster: SurveyRaster, method: str) -> int:
-    mask = raster.valid if ESTIMATORS[method].channel == "terrain" else raster.color_valid
-    return int(mask.sum())
+def _sigma(
+    reference: SurveyRaster,
+    moving: SurveyRaster,
+    masks: tuple[Bool, Bool],
+    peak: Peak,
+    pairs: Callable[[tuple[int, int]], list[tuple[Float64, Float64]]],
+) -> Float64:
+    """Mean square error of a peak as its blocks tell it; of its curvature where they do not."""
+    at, grids = (peak.east, peak.north), (reference.grid, moving.grid)
+    fields = pairs(whole_shift(grids, peak.whole))
+    blocks = correlated_blocks(fields, masks, grids, peak.whole, at)
+    ground = overlap_ground(masks, grids, at)
+    if blocks is None or ground is None:
+        return peak.sigma
+    sigma = error_bar(at, blocks, ground, FLOOR * moving.grid.cell)
+    return peak.sigma if sigma is None else sigma
+
+
+def _mask(raster: SurveyRaster, method: str) -> Bool:
+    return raster.valid if ESTIMATORS[method].channel == "terrain" else raster.color_valid
 
 
 def _no_image(reference: SurveyRaster, moving: SurveyRaster) -> str:
@@ -210,8 +235,6 @@ def _sift(reference: SurveyRaster, moving: SurveyRaster, settings: Settings) -> 
     if consensus is None:
         return failed("sift", f"only {total} matches", evidence)
     count = int(consensus.inliers.sum())
-    places = evidence["reference_points"][consensus.inliers]
-    offsets = places - evidence["moving_points"][consensus.inliers]
     evidence = dict(evidence) | {"false_alarms": consensus.false_alarms}
     if options.exhaustive_vote and consensus.false_alarms > options.max_false_alarms:
         reason = (
@@ -229,7 +252,7 @@ def _sift(reference: SurveyRaster, moving: SurveyRaster, settings: Settings) -> 
         "chance alone would bring as many matches together" if by_chance else "",
         consensus.east,
         consensus.north,
-        sift.spread(offsets, places),
+        sift.spread(reference, moving, consensus, evidence, options.inlier_radius),
         count / total,
         (count - consensus.second) / max(np.sqrt(max(consensus.second, 1)), 1.0),
         float("nan"),

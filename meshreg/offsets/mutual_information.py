@@ -12,14 +12,16 @@ Counts for all offsets at once come from correlating the level sets ``[A = a]`` 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from meshreg.offsets.channels import grey, local_normalised
 from meshreg.offsets.correlate import Correlator, Window, overlap_floor
+from meshreg.offsets.sandwich import laid
 from meshreg.offsets.surface import Peak, find_peak
-from meshreg.settings import Settings
+from meshreg.settings import MutualInformationSettings, Settings
 from meshreg.types import Bool, Float64, SurveyRaster
 
 SINGLE_CELLS = 200_000
@@ -41,7 +43,8 @@ def scan(
         surface, counts = fft_surface(first, second, masks, window, share, options.bins)
         quality = without_small_sample_bias(surface, counts) * counts
     peak = find_peak(quality, window.east, window.north, exclusion=max(0.5, 3 * window.cell))
-    evidence = {"surface": surface, "lower_is_better": False, "counts": counts}
+    pairs = partial(_asked, reference, moving, (first, second), options)
+    evidence = {"surface": surface, "lower_is_better": False, "counts": counts, "pairs": pairs}
     return peak, float(surface[peak.index]) if peak else float("nan"), evidence
 
 
@@ -143,6 +146,46 @@ def without_small_sample_bias(surface: Float64, counts: Float64) -> Float64:
         return surface
     multiple = float(np.median((surface * counts)[finite]))
     return surface - multiple / np.maximum(counts, 1.0)
+
+
+def _asked(
+    reference: SurveyRaster,
+    moving: SurveyRaster,
+    sets: tuple[Any, Any],
+    options: MutualInformationSettings,
+    shift: tuple[int, int],
+) -> list[tuple[Float64, Float64]]:
+    """Return what blocks are asked with: raw grey, hundreds of levels are too much for them."""
+    bins = options.bins
+    if options.high_pass <= 0 or bins > 32:
+        plain = MutualInformationSettings()
+        bins = plain.bins
+        sets = levels(reference, bins, plain.high_pass), levels(moving, bins, plain.high_pass)
+    return block_fields(*sets, (reference.color_valid, moving.color_valid), shift, bins)
+
+
+def block_fields(
+    first: Any, second: Any, masks: tuple[Bool, Bool], shift: tuple[int, int], bins: int
+) -> list[tuple[Float64, Float64]]:
+    """Fields whose products add up to the information that the images share at a shift.
+
+    To first order the information of a cell with levels a, b is ``p_ab / (p_a p_b) - 1``, which
+    correspondence analysis takes apart into products of one function of a and one of b (Greenacre,
+    Theory and Applications of Correspondence Analysis, 1984, chapter 4): brightness first, then
+    contrast. The two strongest are kept; the rest is noise in a block.
+    """
+    under = laid(first, shift, second.shape, 0)
+    both = laid(masks[0], shift, second.shape, 0) & masks[1]
+    joint = np.bincount(under[both].astype(int) * bins + second[both], minlength=bins * bins)
+    share = joint.reshape(bins, bins) / max(int(joint.sum()), 1)
+    rows, cols = share.sum(axis=1), share.sum(axis=0)
+    roots = np.sqrt(np.maximum(rows, 1e-12)), np.sqrt(np.maximum(cols, 1e-12))
+    left, sizes, right = np.linalg.svd((share - np.outer(rows, cols)) / np.outer(*roots))
+    pairs = []
+    for k in (0, 1):
+        a = np.where(masks[0], (sizes[k] * left[:, k] / roots[0])[first], 0.0)
+        pairs.append((a, np.where(masks[1], (right[k] / roots[1])[second], 0.0)))
+    return pairs
 
 
 def _n_log_n(counts: Float64) -> Float64:

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from meshreg.offsets.channels import grey, local_normalised
+from meshreg.offsets.sandwich import BLOCK, FLOOR, MOST, Blocks, error_bar, overlap_ground
 from meshreg.settings import Settings, SiftSettings
 from meshreg.types import Bool, Float64, SurveyRaster, UInt8
 
@@ -210,11 +211,37 @@ def _consensus(
     return Consensus(float(centre[0]), float(centre[1]), inliers, second, false_alarms)
 
 
-def spread(offsets: Float64, places: Float64, block: float = 2.0) -> Float64:
-    """(2, 2) covariance of the inliers' mean: matches in one block of `block` metres err alike."""
-    if len(offsets) < 3:
-        return np.eye(2) * 0.2**2
-    blocks = np.unique(np.floor(places / block), axis=0)
-    deviation = offsets - offsets.mean(axis=0)
-    covariance = deviation.T @ deviation / max(len(offsets) - 1, 1) / max(len(blocks), 1)
-    return np.asarray(covariance + 0.001**2 * np.eye(2))  # a survey matched to itself
+def spread(
+    reference: SurveyRaster,
+    moving: SurveyRaster,
+    consensus: Consensus,
+    evidence: Mapping[str, Any],
+    inlier_radius: float,
+) -> Float64:
+    """(2, 2) mean square error [m²] of the consensus, as its blocks tell it (`sandwich`).
+
+    A block's own offset is the median of its matches within 2.5 inlier radii of the consensus:
+    the inliers alone would not tell how far a block lies beyond their radius.
+    """
+    at = (consensus.east, consensus.north)
+    least = max(0.001, FLOOR * moving.grid.cell)  # m: a survey matched to itself
+    places = evidence["moving_points"]
+    offsets = evidence["reference_points"] - places
+    near = consensus.inliers | (np.hypot(*(offsets - at).T) <= 2.5 * inlier_radius)
+    extent = max(float(np.ptp(places[near], axis=0).max()), 0.1)
+    side = float(np.clip(BLOCK, extent / MOST, extent / 4))
+    _, block = np.unique(np.floor(places / side).astype(int), axis=0, return_inverse=True)
+    block = block.reshape(-1)
+    centres, own, slopes = [], [], []
+    for number in np.unique(block[near]):
+        mine = near & (block == number)
+        agreed = offsets[mine & consensus.inliers]
+        centres.append(places[mine].mean(axis=0))
+        own.append(np.median(offsets[mine], axis=0))
+        slopes.append((agreed - at).sum(axis=0))
+    count = int(consensus.inliers.sum())
+    blocks = Blocks(np.array(centres), np.array(own), np.array(slopes), -count * np.eye(2))
+    masks, grids = (reference.color_valid, moving.color_valid), (reference.grid, moving.grid)
+    ground = overlap_ground(masks, grids, at)
+    sigma = None if ground is None else error_bar(at, blocks, ground, least)
+    return np.eye(2) * inlier_radius**2 if sigma is None else sigma

@@ -31,6 +31,8 @@ class Peak:
     border : bool
         Whether the peak lies on the edge of what was searched.
     index : (row, col)
+    whole : (east, north)
+        Position of the best cell [m].
     """
 
     east: float
@@ -41,6 +43,7 @@ class Peak:
     sigma: Float64
     border: bool
     index: tuple[int, int]
+    whole: tuple[float, float]
 
 
 def find_peak(surface: Float64, east: Float64, north: Float64, exclusion: float) -> Peak | None:
@@ -85,6 +88,7 @@ def find_peak(surface: Float64, east: Float64, north: Float64, exclusion: float)
         sigma=_sigma(surface, far, hessian, cell),
         border=_touches_border(surface, row, col),
         index=(row, col),
+        whole=(float(east[col]), float(north[row])),
     )
 
 

@@ -20,7 +20,7 @@ import numpy as np
 from meshreg.offsets.channels import high_pass
 from meshreg.offsets.correlate import Correlator, Window, overlap_floor
 from meshreg.offsets.surface import Peak, find_peak
-from meshreg.settings import Settings
+from meshreg.settings import Settings, TerrainSettings
 from meshreg.types import Float64, SurveyRaster
 
 FLAT = 1e-6  # smallest s1 * s2 that is divided by [m²]
@@ -44,7 +44,9 @@ def scan(
         surface, counts = cost_surface(reference, moving, window, share)
         quality = -surface
     peak = find_peak(quality, window.east, window.north, exclusion=max(0.5, 3 * window.cell))
+    scales = settings.terrain.high_pass or TerrainSettings().high_pass
     evidence = {
+        "pairs": lambda _: block_fields(reference, moving, scales),
         "surface": surface,
         "lower_is_better": not settings.terrain.high_pass,
         "counts": counts,
@@ -106,6 +108,22 @@ def correlation_surface(
         scored &= power > FLAT * 1e-6 * np.maximum(counts, 1.0)
         total += np.divide(cross, power, out=np.zeros_like(cross), where=power > 0)
     return np.where(scored, total / len(scales), np.nan), counts
+
+
+def block_fields(
+    reference: SurveyRaster, moving: SurveyRaster, scales: tuple[float, ...]
+) -> list[tuple[Float64, Float64]]:
+    """High-passed heights of both at each scale, of unit length: what the blocks are asked with.
+
+    The paper's raw heights too: within a block a slope of the warp would pass for an offset.
+    """
+    pairs = []
+    first, second = absolute_heights(reference, moving)
+    for sigma in scales:
+        a, b = high_pass(first, reference.valid, sigma), high_pass(second, moving.valid, sigma)
+        length = float(np.linalg.norm(a) * np.linalg.norm(b))
+        pairs.append((a / max(length, 1e-300), b))
+    return pairs
 
 
 def absolute_heights(reference: SurveyRaster, moving: SurveyRaster) -> tuple[Float64, Float64]:

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from meshreg.jit import jit, prange
-from meshreg.types import Float64, Int32
+from meshreg.types import Bool, Float64, Int32
 
 _CHUNK = 65536
 
@@ -46,6 +46,17 @@ def face_pieces(points: Float64, faces: Int32) -> tuple[Int32, int]:
             count += 1
         label[f] = number[root]
     return label, count
+
+
+@jit(nogil=True)
+def corners_of(faces: Int32, chosen: Bool, n_points: int) -> Bool:
+    """Say for each point whether a chosen face has it as a corner."""
+    corner = np.zeros(n_points, np.bool_)
+    for f in range(faces.shape[0]):
+        if chosen[f]:
+            for k in range(3):
+                corner[faces[f, k]] = True
+    return corner
 
 
 @jit(nogil=True)

@@ -50,7 +50,7 @@ def floating_faces(points: Float64, faces: Int32, spacing: float, unit: float) -
         return everything
     low[:, :2], high[:, :2], spacing = low[:, :2] * unit, high[:, :2] * unit, spacing * unit
     square = 2.0 * spacing
-    corners = np.flatnonzero(np.bincount(faces[main[label]].ravel(), minlength=len(points)))
+    corners = np.flatnonzero(kernels.corners_of(faces, main[label], len(points)))
     places = points[corners] * np.array([unit, unit, 1.0])
     gone = standing_clear(places, low, high, ~main, spacing, square)
     if not gone.any() or area[gone].sum() > _SMALL * total:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +11,7 @@ import numpy as np
 from meshreg.errors import ResourceLimitError, UsageError
 from meshreg.raster.cells import Cells, choose_cells
 from meshreg.raster.spacing import Spacing, measure_spacing, rounded, survey_bounds
-from meshreg.types import Grid, Survey, SurveyRaster, Transform
+from meshreg.types import Float64, Grid, Survey, SurveyRaster, Transform
 
 __all__ = [
     "Cells",
@@ -23,6 +24,7 @@ __all__ = [
     "measure_spacing",
     "survey_bounds",
     "survey_grid",
+    "survey_grids",
 ]
 
 LEAST_SHARE = 0.5  # a cell with data on less of its area is empty: the mean would sit to one side
@@ -49,6 +51,22 @@ def survey_grid(
     transform : Transform, optional
         `reference_from_moving`: the grid is to hold the moved survey.
     """
+    return _holding(survey_bounds(survey, transform), cell, lattice, survey.crs)
+
+
+def survey_grids(
+    survey: Survey,
+    cells: Mapping[str, float],
+    lattice: float | None = None,
+    *,
+    transform: Transform | None = None,
+) -> dict[str, Grid]:
+    """Return `survey_grid` for each of the named cells [m]; the survey is measured once."""
+    bounds = survey_bounds(survey, transform)
+    return {name: _holding(bounds, cell, lattice, survey.crs) for name, cell in cells.items()}
+
+
+def _holding(bounds: Float64, cell: float, lattice: float | None, crs: str | None) -> Grid:
     lattice = cell if lattice is None else lattice
     times = round(lattice / cell) if cell > 0 else 0
     if not (times >= 1 and abs(times * cell - lattice) <= 1e-9 * lattice):
@@ -56,14 +74,12 @@ def survey_grid(
             f"The lattice of {lattice} m is no multiple of the cell of {cell} m.",
             remedy="Give a positive cell, and a lattice that it divides.",
         )
-    low, high = survey_bounds(survey, transform) / lattice
+    low, high = bounds / lattice
     # What sticks out by less than a millionth of a cell is rounding.
     west, south = (math.floor(value + 1e-6) for value in low[:2])
     east, north = (math.ceil(value - 1e-6) for value in high[:2])
     shape = (max(north - south, 1) * times, max(east - west, 1) * times)
-    return Grid(
-        rounded(west * lattice), rounded(max(north, south + 1) * lattice), cell, shape, survey.crs
-    )
+    return Grid(rounded(west * lattice), rounded(max(north, south + 1) * lattice), cell, shape, crs)
 
 
 def check_size(grid: Grid, max_cells: int) -> None:

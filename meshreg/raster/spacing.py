@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
 from meshreg.errors import InputError
-from meshreg.types import Float64, Maps, Mesh, PointCloud, Survey, Transform
+from meshreg.types import Float64, Maps, Mesh, PointCloud, Survey, Transform, ends
 
 _SAMPLE = 50_000  # faces or points looked at; every n-th, so that the answer is repeatable
 
@@ -28,6 +29,9 @@ class Spacing:
     texels: float | None
 
 
+_MEASURED: WeakKeyDictionary[Survey, Spacing] = WeakKeyDictionary()  # asked for seven times a pair
+
+
 def measure_spacing(survey: Survey) -> Spacing:
     """Measure how far apart the survey's points and texels are, seen from above.
 
@@ -40,6 +44,12 @@ def measure_spacing(survey: Survey) -> Spacing:
     InputError
         If the survey covers no ground: no faces, or all points in one place or on one line.
     """
+    if survey not in _MEASURED:
+        _MEASURED[survey] = _measured(survey)
+    return _MEASURED[survey]
+
+
+def _measured(survey: Survey) -> Spacing:
     geometry = survey.geometry
     if isinstance(geometry, Maps):
         texels = None if geometry.color_grid is None else geometry.color_grid.cell
@@ -141,29 +151,30 @@ def survey_bounds(survey: Survey, transform: Transform | None = None) -> Float64
     if isinstance(geometry, Maps):
         points = _map_corners(geometry)
     else:
+        counted = geometry.faces if isinstance(geometry, Mesh) else geometry.points
+        if transform is None and len(counted) and np.isfinite(survey.bounds).all():
+            return survey.bounds  # looked at once, however often it is asked for
         points = geometry.points
         if isinstance(geometry, Mesh):
             used = np.zeros(len(points), bool)
             used[geometry.faces.ravel()] = True
             points = points if used.all() else points[used]
-        if transform is None:  # one pass without a copy: NaN is skipped, infinity found below
-            low, high = _finite_bounds(points)
-            return _checked_bounds(survey, np.stack([low, high]) + survey.origin)
-    points = points + survey.origin
-    if transform is not None:
-        points = transform.apply(points)
-    return _checked_bounds(survey, np.stack(_finite_bounds(points)))
+    if transform is None:
+        return _checked_bounds(survey, np.stack(_finite_bounds(points)) + survey.origin)
+    home = transform.apply(survey.origin)  # moved there once, not with each point
+    points = points @ np.ascontiguousarray(transform.linear.T)
+    return _checked_bounds(survey, np.stack(_finite_bounds(points)) + home)
 
 
 def _finite_bounds(points: Float64) -> tuple[Float64, Float64]:
     if not len(points):
         return np.full(3, np.inf), np.full(3, -np.inf)
-    low, high = points.min(axis=0), points.max(axis=0)
+    low, high = ends(points)
     if not np.isfinite([low, high]).all():
         points = points[np.isfinite(points).all(axis=1)]
         if not len(points):
             return np.full(3, np.inf), np.full(3, -np.inf)
-        low, high = points.min(axis=0), points.max(axis=0)
+        low, high = ends(points)
     return low, high
 
 

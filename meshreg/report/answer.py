@@ -45,16 +45,24 @@ def _numbers(result: Result) -> str:
         ):
             rows.append((name, f"{number(value)} m", f"± {number(sigma, '.3f')} m"))
         yaw = f"{number(words.yaw_degrees(r), '+.3f')}°"
-        rows.append(("Yaw", yaw, f"± {number(sigmas[3], '.3f')}°"))
+        rows.append(("Yaw", yaw, f"± {number(sigmas[3], '.3f')}°, anticlockwise"))
         if (tilt := words.tilt_degrees(r)) > 0:
             rows.append(("Tilt", f"{number(tilt, '.3f')}°", "from the vertical"))
+        if (scale := f"{r.transform.scale:.5f}") != f"{1:.5f}":
+            rows.append(("Scale", scale, "times the moving survey's lengths"))
+    if (probability := words.probability(r)) is not None:
+        what = "it" if r.verdict == "accepted" else "the best hypothesis"
+        more = f"that {what} is right; calibrated on synthetic pairs"
+        rows.append(("Probability", probability, more))
     compared = r.after or r.before
     if compared.get("overlap") is not None:
-        rows.append(("Overlap", number(compared["overlap"], ".0%"), "of the smaller survey"))
+        more = "of the smaller survey" + ("" if r.after else ", as delivered")
+        rows.append(("Overlap", number(compared["overlap"], ".0%"), more))
     if r.after.get("height_nmad") is not None:
         before = f"{number(r.before.get('height_nmad'), '.3f')} m before"
         rows.append(("Height NMAD", f"{number(r.after['height_nmad'], '.3f')} m", before))
-    alarm = result.kept.get("meta", {}).get("false_alarm")
+    rows += _internal(result)
+    alarm = r.false_alarm
     if alarm is not None:
         rows.append(("Chance of a false alarm", _chance(float(alarm)), "were the ground unrelated"))
     cells = "".join(
@@ -66,9 +74,24 @@ def _numbers(result: Result) -> str:
         best = "The best hypothesis, not accepted. " if r.verdict == "review" else ""
         note = (
             f'<p class="soft">{best}What is added to the moving survey, at the centre of its '
-            "bounding box; ± is one sigma.</p>"
+            "bounding box; ± is one sigma of the rigid move.</p>"
         )
     return f'{note}<dl class="numbers">{cells}</dl>' if rows else ""
+
+
+def _internal(result: Result) -> list[tuple[str, str, str]]:
+    """Say what the models' bending leaves, which no rigid move undoes and no sigma above holds."""
+    internal = result.registration.internal or {}
+    applied = bool(internal.get("applied"))
+    left = [
+        number((internal.get(part) or {}).get("held_out" if applied else "held_out_rigid"), ".3f")
+        for part in ("horizontal", "vertical")
+    ]
+    if left[0] == number(None):
+        return []
+    more = "after the warp" if applied else "the models' bending, not in ±"
+    up = "" if left[1] == number(None) else f", {left[1]} m up"
+    return [("Left in the tiles, rms", f"{left[0]} m", f"horizontally{up}: {more}")]
 
 
 def _chance(alarm: float) -> str:
@@ -83,15 +106,24 @@ def _next(result: Result) -> str:
     steps = words.next_steps(result.registration)
     if not steps:
         return ""
-    lines = "".join(f"<li>{_with_code(step)}</li>" for step in steps)
+    here = [  # the same sentences are printed where there is no page
+        step.replace("in report.html", "on this page").replace("report.html", "this page")
+        for step in steps
+    ]
+    lines = "".join(f"<li>{_with_code(step)}</li>" for step in here)
     return f'<div class="next"><h3>What to do next</h3><ul>{lines}</ul></div>'
 
 
 def _validated(result: Result) -> str:
-    """Return the way to the comparison with tie points that were picked, where there is one."""
+    """Return what tie points that were picked make of it, and the way to that page."""
     if "validation.html" not in {name for name, _ in result.files}:
         return ""
-    return f"<p>Compared with tie points picked by hand: {link('validation.html')}</p>"
+    way = link("validation.html", "the comparison in full")
+    yes, said = (result.validation.get(key) for key in ("confirmed", "said"))
+    if not isinstance(said, str):
+        return f"<p>Compared with tie points picked by hand: {way}</p>"
+    word = "Confirmed" if yes is True else "Not confirmed"
+    return f"<p><strong>{word} by tie points picked by hand</strong>: {say(said)}; {way}.</p>"
 
 
 def _with_code(text: str) -> str:

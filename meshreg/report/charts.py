@@ -30,8 +30,11 @@ def _ellipse(kind: str, frame: Frame, centre: Sequence[float], sigma: Any) -> st
     return f'<ellipse class="ellipse {name}" {turn} rx="{half[0]:.2f}" ry="{half[1]:.2f}"/>'
 
 
-def offsets(registration: Registration) -> str:
-    """Each method's offset with its 95 % ellipse, and the result."""
+def offsets(registration: Registration, answer: Mapping[str, Any] | None = None) -> str:
+    """Each method's offset with its 95 % ellipse, and the result.
+
+    `answer` is the result's offset and sigma where the methods measured; without it the record's.
+    """
     answers: list[tuple[str, str, tuple[float, float], Any, bool]] = [
         (e.method, f"{style.method_name(e.method)} ({e.status})", (e.east, e.north), e.sigma,
          e.status != "ok")
@@ -41,6 +44,8 @@ def offsets(registration: Registration) -> str:
     if registration.transform is not None:
         east, north = (float(value) for value in registration.transform.offset[:2])
         sigma = None if registration.covariance is None else registration.covariance[:2, :2]
+        if answer is not None:
+            (east, north), sigma = answer["offset"], answer["sigma"]
         answers.append(("result", f"result ({registration.verdict})", (east, north), sigma, False))
     if not answers:
         return ""
@@ -74,9 +79,12 @@ def _said(place: Sequence[float]) -> str:
     return f"{number(place[0])}, {number(place[1])} m"
 
 
-def scores(picture: Any, about: Mapping[str, Any], name: str) -> str:
-    """Score of every offset that was tried, with the chosen and the second peak."""
-    west, south, east, north = about["bounds"]
+def scores(picture: Any, about: Mapping[str, Any], name: str, *, near: bool = False) -> str:
+    """Score of every offset that was tried, with the chosen and the second peak.
+
+    `near` are those around the chosen peak alone.
+    """
+    west, south, east, north = about["near" if near else "bounds"]
     frame = Frame.equal((west, east), (south, north))
     x, y = frame.at(west, north)
     wide, tall = (east - west) * frame.scale, (north - south) * frame.scale
@@ -88,14 +96,15 @@ def scores(picture: Any, about: Mapping[str, Any], name: str) -> str:
     body += frame.drawn("east to add to the moving survey [m]", "north to add [m]", grid=False)
     named = []
     for kind, text in (("second", "second peak"), ("best", "chosen peak")):
-        if about.get(kind):
-            px, py = frame.at(*about[kind])
+        peak = about.get(kind)
+        if peak and west <= peak[0] <= east and south <= peak[1] <= north:
+            px, py = frame.at(*peak)
             halo = f'<circle class="halo" cx="{px:.2f}" cy="{py:.2f}" r="13"/>'
             spot = halo + mark(kind, px, py)
             body += f'<g class="peaks shadow">{spot}</g><g class="peaks">{spot}</g>'
-            named.append((kind, f"{text} {_said(about[kind])}", False))
-    title = f"Score of each offset: {name}"
-    return frame.picture(body, title) + key(reversed(named))
+            named.append((kind, f"{text} {_said(peak)}", False))
+    title = f"Score of each offset: {name}{', around the chosen peak' if near else ''}"
+    return frame.picture(body, title) + ("" if near else key(reversed(named)))
 
 
 def histogram(counts: Any, edges: Any, median: float | None, nmad: float | None) -> str:
@@ -175,11 +184,13 @@ def residuals(field: Any, bounds: Sequence[float], relief: Any) -> tuple[str, st
         px, py = frame.at(tile[0] - corner[0], tile[1] - corner[1])
         if field.shape[1] > 6:
             modelled += _arrow(px, py, k * tile[5], -k * tile[6], "arrow model")
-        measured += _arrow(px, py, k * tile[2], -k * tile[3]) if keep else _cross(px, py)
+        shade = 0.3 + 0.7 * float(tile[4] / weight.max())
+        arrow = _arrow(px, py, k * tile[2], -k * tile[3], shade=shade)
+        measured += arrow if keep else _cross(px, py)
     caption = (
         f"Offsets left in {int(used.sum())} of {used.size} tiles, weighted rms "
-        f"{1000 * rms:.1f} mm; arrows are drawn {stretch:,.0f} times too long. "
-        "Crosses: tiles set aside as outliers."
+        f"{1000 * rms:.1f} mm; arrows are drawn {stretch:,.0f} times too long, paler with less "
+        "weight. Crosses: tiles set aside as outliers."
     )
     if modelled:
         caption += " Broad and pale: what the named model says there."
@@ -212,6 +223,29 @@ def ups(field: Any, bounds: Sequence[float], relief: Any) -> tuple[str, str]:
     return frame.picture(body, "Heights left, tile by tile"), caption
 
 
+def stable(picture: Any, about: Mapping[str, Any], bounds: Sequence[float], relief: Any) -> str:
+    """Draw which ground told the height and the tilt, over the relief, with its legend."""
+    frame, corner, body = _ground(bounds, relief)
+    west, south, east, north = (float(value) for value in about["bounds"])
+    x, y = frame.at(west - corner[0], north - corner[1])
+    wide, tall = (east - west) * frame.scale, (north - south) * frame.scale
+    body += (
+        f'<image class="veil" href="{data_uri(picture)}" x="{x:.2f}" y="{y:.2f}" '
+        f'width="{wide:.2f}" height="{tall:.2f}" preserveAspectRatio="none"/>'
+    )
+    names = (
+        ("stable", "stable, used for height and tilt"),
+        ("changed", "changed against the ground around it"),
+        ("set_aside", "changed as a whole block, told by its neighbours"),
+    )
+    legend = "".join(
+        f'<li><svg viewBox="0 0 18 18" aria-hidden="true"><rect class="{name}" width="18" '
+        f'height="18"/></svg>{text}: {number(about[name], ".0%")}</li>'
+        for name, text in names
+    )
+    return f'{frame.picture(body, "Stable ground")}<ul class="key">{legend}</ul>'
+
+
 def _ground(bounds: Sequence[float], relief: Any) -> tuple[Frame, tuple[float, float], str]:
     """Axes over the survey's relief; the corner from which they count; what is drawn so far."""
     west, south, east, north = (float(value) for value in bounds)
@@ -237,17 +271,20 @@ def _cross(x: float, y: float) -> str:
     return f'<path class="aside" d="M{x - 4:.1f} {y - 4:.1f}l8 8m0 -8l-8 8"/>'
 
 
-def _arrow(x: float, y: float, dx: float, dy: float, look: str = "arrow") -> str:
+def _arrow(
+    x: float, y: float, dx: float, dy: float, look: str = "arrow", shade: float = 1.0
+) -> str:
     length = math.hypot(dx, dy)
+    pale = f' opacity="{shade:.2f}"' if shade < 0.995 else ""
     if length < 0.5:
-        return f'<circle class="{look}" cx="{x:.1f}" cy="{y:.1f}" r="1"/>'
+        return f'<circle class="{look}" cx="{x:.1f}" cy="{y:.1f}" r="1"{pale}/>'
     ux, uy = dx / length, dy / length
     head = min(6.0, 0.45 * length)
     ex, ey = x + dx, y + dy
     left = f"L{ex - head * (ux + 0.5 * uy):.1f} {ey - head * (uy - 0.5 * ux):.1f}"
     right = f"L{ex - head * (ux - 0.5 * uy):.1f} {ey - head * (uy + 0.5 * ux):.1f}"
     tip = f"M{ex:.1f} {ey:.1f}"
-    return f'<path class="{look}" d="M{x:.1f} {y:.1f}L{ex:.1f} {ey:.1f}{left}{tip}{right}"/>'
+    return f'<path class="{look}" d="M{x:.1f} {y:.1f}L{ex:.1f} {ey:.1f}{left}{tip}{right}"{pale}/>'
 
 
 def extents(boxes: Sequence[tuple[str, str, Any]]) -> str:

@@ -18,7 +18,10 @@ _STILL = 160_000  # bytes
 
 def mosaics(result: Result) -> str:
     """Return both orthomosaics over each other."""
-    lead = "Drag the bar: the reference is on its left, the moving survey on its right."
+    lead = (
+        "The reference is on the left of the bar, the moving survey on its right."
+        '<span class="js-only screen-only"> Drag it.</span>'
+    )
     return _viewer(result, "ortho", "mosaics", "Orthomosaics", lead)
 
 
@@ -81,9 +84,11 @@ def _tools(kind: str, found: list[str]) -> str:
         switch = _choice(
             f"{kind}-stage", "Moving survey", (("before", "Before"), ("after", "After")), 1
         )
+    bright = '<button type="button" data-bright aria-pressed="false">Brighten</button>'
     return (
         f'<div class="tools js-only">{switch}'
         '<button type="button" data-flicker aria-pressed="false">Flicker</button>'
+        f"{bright if kind == 'ortho' else ''}"
         '<span class="end"><button type="button" data-act="out" aria-label="Zoom out">−</button>'
         '<button type="button" data-act="in" aria-label="Zoom in">+</button>'
         '<button type="button" data-act="reset">Reset</button></span></div>'
@@ -119,8 +124,7 @@ def section(result: Result) -> str:
         f'src="{m.data_uri(kept[f"tone_{stage}"])}"></div></figure>'
         for stage in stages
     ]
-    lines = [("reference", name_of(result.registration.reference))]
-    lines += [(stage, _panel(result, stage)) for stage in stages]
+    lines = [(stage, _line(result, stage)) for stage in ("reference", *stages)]
     legend = "".join(
         f'<li><svg viewBox="0 0 18 18" aria-hidden="true"><path class="line {kind}" d="M0 9H18"/>'
         f"</svg>{say(text)}</li>"
@@ -134,7 +138,7 @@ def section(result: Result) -> str:
     still = '<p class="no-js">Without scripts: figures/section.png shows a section.</p>'
     lead = (
         "Where both surveys agree the relief is grey; blue is the reference alone, orange the "
-        'moving survey alone. <span class="js-only">Drag the line or its ends.</span>'
+        'moving survey alone. <span class="js-only screen-only">Drag the line or its ends.</span>'
     )
     title = "Relief overlaid and cross-section"
     return m.section("section", title, lead, m.columns(*panels), profile, still, _heights(kept))
@@ -145,6 +149,13 @@ def _panel(result: Result, stage: str) -> str:
         return "Before registration"
     accepted = result.registration.verdict == "accepted"
     return "After registration" if accepted else "At the best hypothesis"
+
+
+def _line(result: Result, stage: str) -> str:
+    """How a line of the section is called."""
+    which = "reference" if stage == "reference" else "moving"
+    name = name_of(getattr(result.registration, which))
+    return name if stage == "reference" else f"{name}, {_panel(result, stage).lower()}"
 
 
 def _heights(kept: Mapping[str, Any]) -> str:
@@ -171,12 +182,8 @@ def scene(result: Result) -> str:
     viewer = ""
     if "height" in kept.get("meta", {}) and any(f"height_{s}" in kept for s in ("before", "after")):
         stages = [s for s in ("before", "after") if f"height_{s}" in kept]
-        switch = _choice(
-            "scene-stage",
-            "Moving survey",
-            tuple((s, s.capitalize()) for s in stages),
-            len(stages) - 1,
-        )
+        both = tuple((s, s.capitalize()) for s in stages)
+        switch = _choice("scene-stage", "Moving survey", both, 1) if len(stages) > 1 else ""
         show = (("both", "Both"), ("reference", "Reference"), ("moving", "Moving"))
         looks: tuple[tuple[str, str], ...] = (("relief", "Relief"),)
         if "ortho_reference" in kept:
@@ -184,7 +191,7 @@ def scene(result: Result) -> str:
         viewer = (
             f'<div class="js-only"><div class="tools" data-scene-tools>'
             f"{_choice('scene-show', 'Surfaces', show, 0)}{switch}"
-            f"{_choice('scene-look', 'Look', looks, len(looks) - 1)}"
+            f"{_choice('scene-look', 'Look', looks, 1) if len(looks) > 1 else ''}"
             '<label class="range">Height × <input type="range" id="stretch" min="1" max="8" '
             'step="0.5" value="1"><output>1</output></label>'
             '<span class="end"><button type="button" data-scene-home>Reset</button></span></div>'

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from meshreg.report import style
+from meshreg.report import stated, style
 from meshreg.types import OffsetEstimate, Registration
 
 MAX_MATCHES = 400  # lines drawn; more would only be a smear
@@ -43,10 +43,12 @@ def draw_matches(registration: Registration) -> Any:
         axes.set_title(name, fontsize=10)
         place.label(axes, inner=index > 0)
         axes.set_autoscale_on(False)
+    figure.draw_without_rendering()  # lines from axes to axes need both in their places
+    figure.set_layout_engine("none")
     corner = np.array([place.east, place.north])
     ends = (
         np.asarray(matches["reference_points"], float) - corner,
-        np.asarray(matches["moving_points"], float) - corner,
+        stated.delivered(matches["moving_points"], registration.evidence.get("motion")) - corner,
     )
     _lines(figure, (left, right), ends, ~inliers, color=style.MOVING, linewidth=0.3, alpha=0.35)
     _lines(figure, (left, right), ends, inliers, color=style.GOOD, linewidth=0.7, alpha=0.8)
@@ -54,17 +56,18 @@ def draw_matches(registration: Registration) -> Any:
 
 
 def _lines(figure: Any, axes: tuple[Any, Any], ends: Any, chosen: Any, **look: Any) -> None:
-    from matplotlib.patches import ConnectionPatch
+    from matplotlib.collections import LineCollection
 
     index = np.flatnonzero(chosen)
     if index.size > MAX_MATCHES:  # evenly, so that a picture is the same each time
         index = index[np.linspace(0, index.size - 1, MAX_MATCHES).astype(int)]
-    for k in index:
-        line = ConnectionPatch(
-            ends[0][k], ends[1][k], "data", "data", axesA=axes[0], axesB=axes[1], **look
-        )
-        line.set_in_layout(False)
-        figure.add_artist(line)
+    at = [
+        figure.transFigure.inverted().transform(side.transData.transform(points[index]))
+        for side, points in zip(axes, ends, strict=True)
+    ]
+    lines = LineCollection(list(np.stack(at, axis=1)), capstyle="round", **look)
+    lines.set_transform(figure.transFigure)
+    figure.add_artist(lines)
     size = 3.0 * look["linewidth"] + 1
     for side, points in zip(axes, ends, strict=True):
         side.scatter(*points[index].T, s=size, color=look["color"], linewidths=0)
@@ -161,10 +164,8 @@ def draw_offsets(registration: Registration) -> Any:
             [estimate.east], [estimate.north], marker=marker, s=55, edgecolors=color,
             facecolors=fill, zorder=3, label=f"{name} ({estimate.status})",
         )  # fmt: skip
-    if registration.transform is not None:
-        east, north = (float(value) for value in registration.transform.offset[:2])
-        covariance = registration.covariance
-        sigma = None if covariance is None else covariance[:2, :2]
+    if (answer := stated.among_methods(registration)) is not None:
+        (east, north), sigma = answer
         _ellipse(axes, (east, north), sigma, style.INK)
         label = f"result, {registration.verdict} ({east:+.3f}, {north:+.3f}) m"
         axes.scatter([east], [north], marker="+", s=160, color=style.INK, label=label, zorder=4)

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from meshreg.report import evidence, overlays, residuals, scene, style
 from meshreg.types import Registration
@@ -54,6 +57,16 @@ def draw_figures(
     }
     for estimate in registration.estimates:
         jobs[f"scores_{estimate.method}"] = partial(evidence.draw_surface, estimate)
+    if scene_seconds <= 0:
+        return tuple(_drawn(jobs, folder))
+    with ThreadPoolExecutor(1) as beside:  # its child works while the others are drawn here
+        still = beside.submit(scene.draw_scene, registration, folder / "scene.png", scene_seconds)
+        written = _drawn(jobs, folder)
+    return tuple(written + [path for path in (still.result(),) if path])
+
+
+def _drawn(jobs: Mapping[str, Callable[[], Any]], folder: Path) -> list[Path]:
+    """Draw and save; a figure that fails is a warning in the log."""
     written = []
     for name, draw in jobs.items():
         path = folder / f"{name}.png"
@@ -65,16 +78,21 @@ def draw_figures(
         except Exception as error:
             _LOG.warning("The figure %s was not drawn: %s: %s", name, type(error).__name__, error)
             _LOG.debug("why", exc_info=True)
-    if scene_seconds > 0:
-        still = scene.draw_scene(registration, folder / "scene.png", scene_seconds)
-        written += [still] if still else []
-    return tuple(written)
+    return written
 
 
 def _save(figure: Any, path: Path) -> None:
+    """Draw once and write a PNG without transparency: half the time of `savefig`, smaller files."""
+    from PIL import Image
+    from PIL.PngImagePlugin import PngInfo
+
+    figure.canvas.draw()
+    picture = Image.fromarray(np.asarray(figure.canvas.buffer_rgba())[..., :3])
+    about = PngInfo()
+    about.add_text("Software", "meshreg")
     partial_path = path.with_name(f".{path.name}.tmp")
     try:
-        figure.savefig(partial_path, format="png", dpi=style.DPI, metadata={"Software": "meshreg"})
+        picture.save(partial_path, "PNG", pnginfo=about, compress_level=2, dpi=2 * (style.DPI,))
         os.replace(partial_path, path)
     finally:
         partial_path.unlink(missing_ok=True)

@@ -16,38 +16,68 @@ from meshreg.report.result import Result
 
 def left_over(result: Result) -> str:
     """Return what is left after registration: heights, offsets of tiles, statistics."""
+    r = result.registration
+    warped = bool(r.internal and r.internal.get("applied"))
+    internal = ""
+    if r.internal and r.internal.get("said"):
+        said = str(r.internal["said"]).strip().rstrip(".")
+        internal = f"<p>{say(said[:1].upper() + said[1:])}.</p>"
+    if warped:
+        internal += "<p>The registered survey is warped, so that this bending is taken away.</p>"
+    title = "What is left" if r.after else "As delivered"
+    said = _statistics(result) + _error(result) + internal
+    parts = m.columns(*_differences(result), *_ground(result.kept), *_tiles(result.kept, warped))
+    return m.section("left", title, "", said, parts)
+
+
+def _differences(result: Result) -> list[str]:
+    """Return the map of the height differences and how they are spread."""
     r, kept = result.registration, result.kept
-    parts, internal = [], ""
+    if "difference" not in kept:
+        return []
     # The record's median is reference less registered; the map and its histogram are the reverse.
     median, nmad = r.after.get("height_median"), r.after.get("height_nmad")
     median = None if median is None or not math.isfinite(median) else -median + 0.0
     nmad = None if nmad is None or not math.isfinite(nmad) else nmad
-    if "difference" in kept:
-        limit = float(kept["difference_edges"][-1])
-        picture = f'<img alt="Map of height differences" src="{m.data_uri(kept["difference"])}">'
-        parts.append(
-            m.figure(
-                f"<h3>Height of the registered survey above the reference</h3>{picture}",
-                f"Blue: lower than the reference, red: higher; full colour from ±{limit:.3f} m.",
-            )
-        )
-        drawn = charts.histogram(kept["difference_counts"], kept["difference_edges"], median, nmad)
-        said = f"Median {number(median)} m (line), NMAD {number(nmad, '.3f')} m (dashes)."
-        parts.append(m.figure(f"<h3>Height differences</h3>{drawn}", said))
-    if "residuals" in kept and "dem" in kept["meta"]:
-        small = kept.get("small_relief")
-        drawn, said = charts.residuals(kept["residuals"], kept["meta"]["dem"]["bounds"], small)
-        parts.append(m.figure(f"<h3>Residual field</h3>{drawn}" if drawn else "", say(said)))
-    if "residual_ups" in kept and "dem" in kept["meta"]:
-        small = kept.get("small_relief")
-        drawn, said = charts.ups(kept["residual_ups"], kept["meta"]["dem"]["bounds"], small)
-        parts.append(m.figure(f"<h3>Heights left</h3>{drawn}" if drawn else "", say(said)))
-    if r.internal and r.internal.get("said"):
-        said = str(r.internal["said"]).strip().rstrip(".")
-        internal = f"<p>{say(said[:1].upper() + said[1:])}.</p>"
-    title = "What is left" if r.after else "As delivered"
-    said = _statistics(result) + _error(result) + internal
-    return m.section("left", title, "", said, m.columns(*parts))
+    limit = float(kept["difference_edges"][-1])
+    picture = f'<img alt="Map of height differences" src="{m.data_uri(kept["difference"])}">'
+    drawn = charts.histogram(kept["difference_counts"], kept["difference_edges"], median, nmad)
+    said = f"Median {number(median)} m (line), NMAD {number(nmad, '.3f')} m (dashes)."
+    return [
+        m.figure(
+            f"<h3>Height of the registered survey above the reference</h3>{picture}",
+            f"Blue: lower than the reference, red: higher; full color from ±{limit:.3f} m.",
+        ),
+        m.figure(f"<h3>Height differences</h3>{drawn}", said),
+    ]
+
+
+def _ground(kept: Mapping[str, Any]) -> list[str]:
+    """Return the mask of the ground that told the height and the tilt."""
+    meta = kept.get("meta", {})
+    if "ground" not in kept or "dem" not in meta:
+        return []
+    about, bounds = meta["ground"], meta["dem"]["bounds"]
+    drawn = charts.stable(kept["ground"], about, bounds, kept.get("small_relief"))
+    said = "Shares of the ground that both surveys see and that was compared."
+    return [m.figure(f"<h3>Stable ground</h3>{drawn}", said)]
+
+
+def _tiles(kept: Mapping[str, Any], warped: bool) -> list[str]:
+    """Return what is left in each tile: arrows of the offsets, discs of the heights."""
+    if "dem" not in kept.get("meta", {}):
+        return []
+    bounds, small = kept["meta"]["dem"]["bounds"], kept.get("small_relief")
+    figures = []
+    for name, title, draw in (
+        ("residuals", "Residual field", charts.residuals),
+        ("residual_ups", "Heights left", charts.ups),
+    ):
+        if name in kept:
+            drawn, said = draw(kept[name], bounds, small)
+            said += " All of it after the rigid move and before the warp." if warped else ""
+            figures.append(m.figure(f"<h3>{title}</h3>{drawn}" if drawn else "", say(said)))
+    return figures
 
 
 def _error(result: Result) -> str:
@@ -96,20 +126,51 @@ def found(result: Result) -> str:
         for e in r.estimates
     ]
     head = ("method", "says", "east [m]", "north [m]", "sigma [m]", "gap", "overlap", "reason")
-    drawn = charts.offsets(r)
-    plots = [m.figure(f"<h3>Offsets with their 95 % ellipses</h3>{drawn}" if drawn else "",
-                      "Hollow marks: the method itself calls its answer weak.")]  # fmt: skip
-    for method, about in kept.get("meta", {}).get("surfaces", {}).items():
-        if f"surface_{method}" in kept:
-            name = style.method_name(method)
-            plot = charts.scores(kept[f"surface_{method}"], about, name)
-            better = "low" if about.get("lower_is_better") else "high"
-            said = f"Bright is good; of this measure {better} values are."
-            plots.append(m.figure(f"<h3>Score of each offset: {say(name)}</h3>{plot}", said))
+    meta = kept.get("meta", {})
+    drawn = charts.offsets(r, meta.get("answer"))
+    said = "Hollow marks: the method itself calls its answer weak."
+    if "answer" in meta:
+        said += (
+            " The result is drawn as in the middle of the overlap, where the methods measure; the "
+            "top of the page states it at the centre of the moving survey's bounding box."
+        )
+    plot = m.figure(f"<h3>Offsets with their 95 % ellipses</h3>{drawn}" if drawn else "", said)
+    surfaces = [
+        _scores(kept, method, about)
+        for method, about in meta.get("surfaces", {}).items()
+        if f"surface_{method}" in kept
+    ]
     return m.section(
-        "found", "How it was found", "", m.table(head, rows, (2, 3, 4, 5, 6)), m.columns(*plots),
-        _matches(kept), _hypotheses(result),
+        "found", "How it was found", _turned(meta.get("turned")),
+        m.table(head, rows, (2, 3, 4, 5, 6)), m.columns(plot), *surfaces, _matches(kept),
+        _hypotheses(result),
     )  # fmt: skip
+
+
+def _turned(turned: Mapping[str, Any] | None) -> str:
+    """Say that the methods looked at a survey that had been turned first."""
+    if turned is None:
+        return ""
+    scaled = f" and its lengths multiplied by {turned['scale']:.5f}"
+    return (
+        f"The moving survey was turned by {number(turned['yaw_degrees'], '+.2f')}° about its centre"
+        f"{scaled if turned['scale'] != 1.0 else ''} before the methods looked at it: their "
+        "offsets and scores are those of the turned survey, the rest of its yaw is the result's."
+    )
+
+
+def _scores(kept: Mapping[str, Any], method: str, about: Mapping[str, Any]) -> str:
+    """Return the scores of all offsets, and beside them those around the chosen peak."""
+    name = style.method_name(method)
+    plot = charts.scores(kept[f"surface_{method}"], about, name)
+    better = "low" if about.get("lower_is_better") else "high"
+    said = f"Bright is good; of this measure {better} values are."
+    whole = m.figure(f"<h3>Score of each offset: {say(name)}</h3>{plot}", said)
+    near = ""
+    if f"near_{method}" in kept and about.get("near"):
+        drawn = charts.scores(kept[f"near_{method}"], about, name, near=True)
+        near = m.figure(f"<h3>Around its chosen peak</h3>{drawn}", "The same colors.")
+    return m.columns(whole, near)
 
 
 def _sigma(sigma: Any) -> float:

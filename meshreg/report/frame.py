@@ -17,7 +17,7 @@ class Frame:
 
     x: tuple[float, float]
     y: tuple[float, float]
-    left: float = 58.0
+    left: float = 64.0
     top: float = 12.0
     wide: float = 390.0
     tall: float = 300.0
@@ -60,7 +60,7 @@ class Frame:
         frame = f'<rect class="axis" x="{self.left}" y="{self.top}" width="{self.wide}" '
         parts.append(f'{frame}height="{self.tall:.2f}"/>')
         parts.append(text(self.left + self.wide / 2, bottom + 35, x_name, "", "middle"))
-        turn = f'transform="translate(13 {self.top + self.tall / 2:.1f}) rotate(-90)"'
+        turn = f'transform="translate(12 {self.top + self.tall / 2:.1f}) rotate(-90)"'
         parts.append(f'<text {turn} text-anchor="middle">{say(y_name)}</text>')
         return "".join(parts)
 
@@ -99,8 +99,9 @@ SHAPES = {
     "terrain": '<rect x="-4.5" y="-4.5" width="9" height="9"/>',
     "mutual_information": '<path d="M0 -6.5L6.5 0L0 6.5L-6.5 0Z"/>',
     "result": '<path d="M-9 0H9M0 -9V9"/>',
-    "best": '<path d="M-7 0H7M0 -7V7"/>',
-    "second": '<path d="M-5.5 -5.5L5.5 5.5M-5.5 5.5L5.5 -5.5"/>',
+    # open in the middle, so that the peak itself is seen
+    "best": '<path d="M-9 0H-4M4 0H9M0 -9V-4M0 4V9"/>',
+    "second": '<path d="M-7 -7L-3 -3M3 3L7 7M-7 7L-3 3M3 -3L7 -7"/>',
 }
 
 

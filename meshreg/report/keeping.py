@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from meshreg.report import pictures, style
-from meshreg.types import Float64, Grid, OffsetEstimate, Registration, SurveyRaster
+from meshreg.report import pictures, stated, style
+from meshreg.types import Float64, Grid, OffsetEstimate, Registration, SurveyRaster, Transform
 
 SCHEMA = "meshreg.evidence/1"
 STAGES = ("reference", "before", "after")
@@ -26,6 +26,9 @@ BINS = 81
 _MODELLED = ("model_east", "model_north")
 # Bytes; with a third more for base64 they leave a page of 8 MB its text.
 ORTHO, RELIEF, TONE, DIFFERENCE, SMALL = 900_000, 280_000, 170_000, 200_000, 70_000
+# What a cell of ground was, in the numbers of `meshreg.heights`, and its colour in the picture.
+GROUNDS = {"changed": (1, "#E69F00"), "set_aside": (2, "#CC79A7"), "stable": (3, "#009E73")}
+NEAR = 0.1  # share of the search window that the picture around a peak shows
 _KEYS = {
     "reference": "reference_{}",
     "before": "moving_{}_before",
@@ -49,16 +52,16 @@ def keep(registration: Registration) -> Kept:
     """
     kept: Kept = {}
     meta: dict[str, Any] = {"schema": SCHEMA}
-    alarm = registration.evidence.get("false_alarm")
-    if alarm is not None and math.isfinite(float(alarm)):
-        meta["false_alarm"] = float(alarm)
     _keep_orthos(registration.evidence, kept, meta)
     _keep_relief(registration.evidence, kept, meta)
     _keep_difference(registration.evidence, kept, meta)
     _keep_residuals(registration.evidence.get("residuals"), kept)
+    _keep_ground(registration.evidence, kept, meta)
     for estimate in registration.estimates:
         _keep_surface(estimate, kept, meta)
-        _keep_matches(estimate, kept, meta)
+        _keep_matches(estimate, registration.evidence.get("motion"), kept, meta)
+    if kept:
+        _keep_answer(registration, meta)
     if not kept and len(meta) == 1:
         return {}
     kept["meta"] = np.frombuffer(json.dumps(meta).encode(), np.uint8)
@@ -158,6 +161,38 @@ def _keep_residuals(field: Any, kept: Kept) -> None:
             kept[name] = np.column_stack([np.asarray(field[key], float) for key in columns])
 
 
+def _keep_ground(evidence: Mapping[str, Any], kept: Kept, meta: dict[str, Any]) -> None:
+    """Keep which ground told the height and the tilt, as a picture on the DEM's grid."""
+    ground, reference = evidence.get("stable"), evidence.get("reference_dem")
+    if ground is None or reference is None:
+        return
+    ground = np.asarray(ground)
+    counts = {name: int((ground == value).sum()) for name, (value, _) in GROUNDS.items()}
+    if not (total := sum(counts.values())):
+        return
+    step = -(-max(ground.shape) // pictures.SIDE)
+    table = np.zeros((256, 4), np.uint8)
+    for value, color in GROUNDS.values():
+        table[value] = [*bytes.fromhex(color[1:]), 255]
+    picture = table[ground[::step, ::step]]
+    kept["ground"] = pictures.encoded(picture, SMALL, exact=True)
+    meta["ground"] = {name: count / total for name, count in counts.items()}
+    meta["ground"]["bounds"] = list(reference.grid.bounds)
+
+
+def _keep_answer(registration: Registration, meta: dict[str, Any]) -> None:
+    """Keep the result as the methods would say it, and by how much the search turned a survey."""
+    answer = stated.among_methods(registration)
+    if answer is not None:
+        (east, north), sigma = answer
+        meta["answer"] = {"offset": [east, north]}
+        meta["answer"]["sigma"] = None if sigma is None else sigma.tolist()
+    motion = registration.evidence.get("motion")
+    if motion is not None:
+        yaw = math.degrees(math.atan2(motion.rotation[1, 0], motion.rotation[0, 0]))
+        meta["turned"] = {"yaw_degrees": yaw, "scale": motion.scale}
+
+
 def _keep_surface(estimate: OffsetEstimate, kept: Kept, meta: dict[str, Any]) -> None:
     evidence = estimate.evidence
     if "surface" not in evidence or not np.isfinite(evidence["surface"]).any():
@@ -178,7 +213,32 @@ def _keep_surface(estimate: OffsetEstimate, kept: Kept, meta: dict[str, Any]) ->
     peaks = {name: _peak(evidence.get(name)) for name in ("best", "second")}
     about = {"bounds": [bounds[0], bounds[2], bounds[1], bounds[3]], "lower_is_better": lower}
     about |= {"low": float(ends[0]), "high": float(ends[1])}
+    near, window = _around(score, bounds, peaks["best"])
+    if near is not None:
+        picture = pictures.colored(near, *ends, colors)
+        kept[f"near_{estimate.method}"] = pictures.encoded(picture, SMALL // 2, exact=True)
+        about["near"] = window
     meta.setdefault("surfaces", {})[estimate.method] = about | peaks
+
+
+def _around(
+    score: Float64, ends: list[float], best: list[float] | None
+) -> tuple[Float64 | None, list[float]]:
+    """Cut a window about the best offset from a score, north at the top; its bounds in metres."""
+    rows, cols = score.shape
+    if best is None or min(rows, cols) < 60:
+        return None, []
+    west, east, south, north = ends
+    size = (east - west) / cols, (north - south) / rows
+    half = max(12, round(0.5 * NEAR * max(rows, cols)))
+    row, col = int((north - best[1]) / size[1]), int((best[0] - west) / size[0])
+    top, left = max(row - half, 0), max(col - half, 0)
+    bottom, right = min(row + half + 1, rows), min(col + half + 1, cols)
+    if top >= bottom or left >= right:
+        return None, []
+    window = [west + left * size[0], north - bottom * size[1]]
+    window += [west + right * size[0], north - top * size[1]]
+    return score[top:bottom, left:right], window
 
 
 def _ends(axis: Float64) -> tuple[float, float]:
@@ -192,7 +252,9 @@ def _peak(peak: Any) -> list[float] | None:
     return [float(value) for value in peak]
 
 
-def _keep_matches(estimate: OffsetEstimate, kept: Kept, meta: dict[str, Any]) -> None:
+def _keep_matches(
+    estimate: OffsetEstimate, motion: Transform | None, kept: Kept, meta: dict[str, Any]
+) -> None:
     """Keep some of the matches, evenly, so that a picture is the same each time."""
     evidence = estimate.evidence
     if "reference_points" not in evidence or len(evidence["inliers"]) == 0 or "matches" in kept:
@@ -203,6 +265,7 @@ def _keep_matches(estimate: OffsetEstimate, kept: Kept, meta: dict[str, Any]) ->
         count = min(MATCHES, index.size)
         chosen.append(index[np.linspace(0, index.size - 1, count).astype(int)] if count else index)
     some = np.concatenate(chosen)
-    ends = [np.asarray(evidence[f"{name}_points"], float)[some] for name in ("reference", "moving")]
-    kept["matches"] = np.column_stack([*ends, inliers[some]])
+    there = np.asarray(evidence["reference_points"], float)[some]
+    here = stated.delivered(np.asarray(evidence["moving_points"], float)[some], motion)
+    kept["matches"] = np.column_stack([there, here, inliers[some]])
     meta["matches"] = {"inliers": int(inliers.sum()), "total": int(inliers.size)}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from typing import Any
 
@@ -13,6 +14,24 @@ from meshreg.report.markup import number, say
 from meshreg.report.result import Result, name_of
 
 _LOG_CHARACTERS = 60_000
+_FILES = (
+    (r"registration\.json", "everything that was found, for programs"),
+    (r"transform_inverse\w*\.txt", "4 × 4 matrix, the way back"),
+    (r"transform_global\.txt", "4 × 4 matrix in absolute coordinates"),
+    (r"transform\w*\.txt", "4 × 4 matrix, moving file to reference file"),
+    (r"reference_dem\.tif", "elevation of the reference"),
+    (r"reference_ortho\.tif", "orthomosaic of the reference"),
+    (r"moving_dem\.tif", "elevation of the registered survey, on the same cells"),
+    (r"moving_ortho\.tif", "orthomosaic of the registered survey, on the same cells"),
+    (r"settings\.toml", "all settings, to do it again"),
+    (r"evidence\.npz", "what this page is drawn from"),
+    (r"log\.txt", "what was done, step by step"),
+    (r"validation\..*", "held against tie points picked by hand"),
+    (r"figures/.*", "a figure of this page, to print"),
+    (r".*_registered\.survey\.toml", "how to read the registered survey"),
+    (r".*_registered_offset\.xyz", "what to add to the registered survey's coordinates"),
+    (r".*_registered\.[a-z0-9]+", "the moving survey, registered"),
+)
 
 
 def methods(result: Result) -> str:
@@ -77,7 +96,10 @@ def record(result: Result) -> str:
         (1,),
     )
     files = m.table(
-        ("file", "size"), [(m.link(name), _size(size)) for name, size in result.files], (1,)
+        ("file", "size"),
+        [(_file(name), _size(size)) for name, size in result.files],
+        (1,),
+        "files",
     )
     log = result.log
     if len(log) > _LOG_CHARACTERS:
@@ -90,6 +112,12 @@ def record(result: Result) -> str:
         f"<details><summary>Log</summary><pre>{say(log)}</pre></details>" if log else "",
     ]
     return m.section("record", "Record", "", *parts)
+
+
+def _file(name: str) -> m.Markup:
+    """Return a link to a file of the result, and what it is where that is known."""
+    said = next((said for pattern, said in _FILES if re.fullmatch(pattern, name)), "")
+    return m.Markup(m.link(name) + (f" <small>{say(said)}</small>" if said else ""))
 
 
 def _flat(settings: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any]]:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,8 @@ class Result:
     log : str
     still : bytes
         A PNG of the 3-D scene; may be empty.
+    validation : mapping
+        `validation.json`, where tie points picked by hand were compared; may be empty.
     """
 
     registration: Registration
@@ -34,6 +37,7 @@ class Result:
     files: Sequence[tuple[str, int]] = ()
     log: str = ""
     still: bytes = b""
+    validation: Mapping[str, Any] = field(default_factory=dict)
 
 
 def gather(registration: Registration, kept: Mapping[str, Any], folder: Path) -> Result:
@@ -47,7 +51,16 @@ def gather(registration: Registration, kept: Mapping[str, Any], folder: Path) ->
     log, still = folder / "log.txt", folder / "figures" / "scene.png"
     text = log.read_text(encoding="utf-8", errors="replace") if log.is_file() else ""
     picture = still.read_bytes() if still.is_file() else b""
-    return Result(registration, kept, files, text, picture)
+    return Result(registration, kept, files, text, picture, _validation(folder))
+
+
+def _validation(folder: Path) -> Mapping[str, Any]:
+    """Return what `meshreg validate` said, if its page lies there; damaged, it says nothing."""
+    try:
+        said = json.loads((folder / "validation.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return said if isinstance(said, dict) and (folder / "validation.html").is_file() else {}
 
 
 def name_of(entry: Mapping[str, Any]) -> str:

@@ -21,30 +21,66 @@ from meshreg.types import Registration
 _LOG = logging.getLogger("meshreg")
 _SIDE = 350  # grid points along the longer side
 
+# VTK itself: pyvista, which wraps it, takes a second to import.
 _CHILD = """
 import sys
-import numpy as np, pyvista as pv
+import numpy as np
+import vtkmodules.vtkRenderingOpenGL2
+from vtkmodules.util.numpy_support import numpy_to_vtk, vtk_to_numpy
+from vtkmodules.vtkCommonCore import vtkPoints
+from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkPolyData
+from vtkmodules.vtkRenderingCore import (
+    vtkActor, vtkCamera, vtkLightKit, vtkPolyDataMapper, vtkRenderer, vtkRenderWindow,
+    vtkWindowToImageFilter,
+)
 folder, target = sys.argv[1:]
 data = dict(np.load(folder + "/scene.npz"))
 east, north = np.meshgrid(data["east"], data["north"])
-plotter = pv.Plotter(off_screen=True, shape=(1, 2), window_size=(2400, 1200), border=False)
-plotter.set_background("white")
+window = vtkRenderWindow()
+window.SetOffScreenRendering(True)
+window.SetSize(2400, 1200)
+window.SetMultiSamples(0)
+lights, camera, ends = vtkLightKit(), vtkCamera(), []
+camera.SetPosition(-0.45, -1.0, 0.9)
+camera.SetViewUp(0, 0, 1)
 for column, name in enumerate(("reference", "moving")):
-    plotter.subplot(0, column)
     height = data[name]
-    seen = np.isfinite(height)
-    height = np.where(seen, height, data["floor"]) * data["exaggeration"]
-    surface = pv.StructuredGrid(east, north, height)
-    surface["color"] = data[name + "_color"].reshape(-1, 3, order="F")
-    surface["seen"] = seen.ravel(order="F").astype(np.uint8)
-    surface = surface.threshold(0.5, scalars="seen", all_scalars=True)
-    if surface.n_points:
-        plotter.add_mesh(surface, scalars="color", rgb=True, ambient=0.25, specular=0.0)
-plotter.link_views()
-plotter.view_vector((-0.45, -1.0, 0.9), viewup=(0, 0, 1))
-plotter.reset_camera()
-plotter.camera.zoom(1.2)
-np.save(target, plotter.screenshot(return_img=True))
+    node = np.arange(height.size).reshape(height.shape)
+    corners = np.stack([node[:-1, :-1], node[:-1, 1:], node[1:, 1:], node[1:, :-1]], axis=-1)
+    seen = np.isfinite(height.ravel()[corners]).all(axis=-1)
+    used, corners = np.unique(corners[seen], return_inverse=True)
+    points = np.column_stack([x.ravel()[used] for x in (east, north, height)])
+    points[:, 2] *= data["exaggeration"]
+    place, faces, surface = vtkPoints(), vtkCellArray(), vtkPolyData()
+    place.SetData(numpy_to_vtk(points, deep=True))
+    faces.SetData(4, numpy_to_vtk(corners.ravel(), deep=True))
+    surface.SetPoints(place)
+    surface.SetPolys(faces)
+    colors = data[name + "_color"].reshape(-1, 3)[used]
+    surface.GetPointData().SetScalars(numpy_to_vtk(colors, deep=True))
+    mapper, actor, renderer = vtkPolyDataMapper(), vtkActor(), vtkRenderer()
+    mapper.SetInputData(surface)
+    actor.SetMapper(mapper)
+    actor.GetProperty().SetInterpolationToFlat()
+    actor.GetProperty().SetAmbient(0.25)
+    renderer.AddActor(actor)
+    renderer.SetBackground(1, 1, 1)
+    renderer.SetViewport(column / 2, 0, (column + 1) / 2, 1)
+    renderer.UseFXAAOn()
+    lights.AddLightsToRenderer(renderer)
+    renderer.SetActiveCamera(camera)
+    window.AddRenderer(renderer)
+    if used.size:
+        ends += [points.min(axis=0), points.max(axis=0)]
+lights.Update()
+renderer.ResetCamera(np.column_stack([np.min(ends, axis=0), np.max(ends, axis=0)]).ravel())
+reader = vtkWindowToImageFilter()
+reader.SetInput(window)
+reader.ReadFrontBufferOff()
+reader.Update()
+picture = reader.GetOutput()
+wide, tall, _ = picture.GetDimensions()
+np.save(target, vtk_to_numpy(picture.GetPointData().GetScalars()).reshape(tall, wide, 3)[::-1])
 """
 
 
@@ -103,13 +139,13 @@ def _save(picture: Any, path: Path, exaggeration: float = 1.0) -> None:
     parts = [part[top : rows[-1] + margin, left : cols[-1] + margin] for part in halves]
     image = Image.fromarray(np.hstack(parts))
     image.thumbnail((style.MAX_PIXELS, style.MAX_PIXELS))
-    canvas = Image.new("RGB", (image.width, image.height + 30), "white")
-    canvas.paste(image, (0, 30))
+    canvas = Image.new("RGB", (image.width, image.height + 44), "white")
+    canvas.paste(image, (0, 44))
     draw = ImageDraw.Draw(canvas)
     raised = f", heights x {exaggeration:.1f}" if exaggeration > 1.0 else ""
     for column, name in enumerate((f"reference{raised}", f"registered{raised}")):
-        draw.text((12 + column * image.width // 2, 8), name, fill="black", font_size=18)
-    canvas.save(path, format="PNG")
+        draw.text((12 + column * image.width // 2, 8), name, fill="black", font_size=28)
+    canvas.save(path, format="PNG", compress_level=2)
 
 
 def _arrays(registration: Registration) -> dict[str, Any] | None:
@@ -139,7 +175,6 @@ def _arrays(registration: Registration) -> dict[str, Any] | None:
         "moving": moved - base,
         "reference_color": colors[0],
         "moving_color": colors[1],
-        "floor": float(min(np.nanmin(height), np.nanmin(moved))) - base,
         "exaggeration": exaggeration,
     }
 

@@ -26,7 +26,7 @@ METHOD_NAMES = {
     "sift": "SIFT",
     "terrain": "terrain scan",
     "mutual_information": "mutual information",
-    "ties": "tie points",
+    "ties": "tie points (by hand)",
 }
 DPI = 130
 MAX_PIXELS = 2000  # longest side of a picture

@@ -63,6 +63,14 @@ _ADVICE: tuple[tuple[str, tuple[str, ...]], ...] = (
         ),
     ),
     (
+        r"too little to know the place by",
+        (
+            "Flat ground has nothing that the relief could be known by. " + _LOOK,
+            "Color may know it: export the models with textures or vertex colors. So may a larger "
+            "survey, one that reaches rougher ground.",
+        ),
+    ),
+    (
         r"search border|outside the search radius",
         ("The true offset may lie further out: register again with --search-radius {wider:g}.",),
     ),
@@ -231,6 +239,16 @@ def tilt_degrees(registration: Registration) -> float:
     return math.degrees(math.hypot(*transform.rotation[:2, 2]))  # its sine, for so small an angle
 
 
+def probability(registration: Registration) -> str | None:
+    """Return the probability that the best hypothesis is right, never rounded to certainty."""
+    value = registration.probability
+    if value is None or not math.isfinite(value):
+        return None
+    if value > 0.999:
+        return "over 99.9%"
+    return "under 0.1%" if value < 0.001 else f"{value:.1%}"
+
+
 def _outcome(r: Registration) -> str:
     if r.transform is None:
         return f"No registration was accepted: {r.reason.strip().rstrip('.')}."
@@ -243,9 +261,12 @@ def _outcome(r: Registration) -> str:
     tilt = tilt_degrees(r)
     tilted = f", tilts it by {tilt:.4f}°" if tilt > 0 else ""
     word = {"accepted": "accepted", "review": "held for review, not accepted"}[r.verdict]
+    chance = probability(r)
+    sure = f"The probability that it is right is {chance} (calibrated on synthetic pairs)."
     return (
-        f"The registration was {word}: {r.reason.strip().rstrip('.')}. It moves the survey by "
-        f"{_listed(moves)}{tilted} and turns it by {number(yaw_degrees(r), '+.4f')} ± "
+        f"The registration was {word}: {r.reason.strip().rstrip('.')}. "
+        f"{f'{sure} ' if chance else ''}It moves the survey by {_listed(moves)}{tilted} and "
+        f"turns it by {number(yaw_degrees(r), '+.4f')} ± "
         f"{number(sigmas(r)[3], '.4f')}° about the centre of its bounding box (one sigma)."
     )
 

@@ -12,19 +12,18 @@ from typing import Any
 import numpy as np
 
 from meshreg.settings import SiftSettings
+from meshreg.ties.cover import sectors, weak_spots
 from meshreg.ties.hand import (
     PAIRS,
     Hand,
+    free_hand,
     hand_document,
-    hand_registration,
     moved,
-    sectors,
-    turn_first,
-    weak_spots,
+    turn_degrees,
 )
 from meshreg.ties.placing import Placing
 from meshreg.ties.records import TiePoints
-from meshreg.ties.session import Session
+from meshreg.ties.session import Session, as_place
 from meshreg.ties.tiles import TileSource, overlap_points
 from meshreg.types import Float64, Transform
 
@@ -135,11 +134,9 @@ class Desk:
 
     def change(self, revision: int, what: str, values: dict[str, Any]) -> None:
         """Pass a change to the session, points of the moving picture taken to its survey."""
-        if values.get("side") == "moving" and self.registered:
-            x, y = values.get("x"), values.get("y")
-            if isinstance(x, int | float) and isinstance(y, int | float):
-                x, y = (float(v) for v in self.to_moving([[x, y]])[0])
-                values = {**values, "x": x, "y": y}
+        if values.get("side") == "moving" and self.registered and {"x", "y"} <= set(values):
+            x, y = self.to_moving([as_place(values)])[0].tolist()
+            values = {**values, "x": x, "y": y}
         self.session.change(revision, what, values)
 
     def _make_state(self, revision: int) -> dict[str, Any]:
@@ -171,6 +168,7 @@ class Desk:
             "revision": revision,
             "pairs": pairs,
             "hand": None if hand is None else hand_document(hand),
+            "turned": turn_degrees(turn),
             "sectors": [{"name": s.name, "share": s.share, "pairs": s.pairs} for s in parts],
             "weak": list(weak_spots(parts)),
             "links": {name: link.as_dict() for name, link in links.items()},
@@ -182,10 +180,7 @@ class Desk:
     def _hand(self, ties: TiePoints) -> tuple[Hand | None, Transform | None]:
         """Register by hand; again only where a complete pair has changed."""
         if self._said is None or self._said[0] != ties.complete:
-            known = None if self.placing is None else self.placing.registration.transform
-            turn = turn_first(known, ties, self.settings.inlier_radius)
-            hand = hand_registration(ties, self.settings, motion=turn)
-            self._said = ties.complete, (hand, turn)
+            self._said = ties.complete, free_hand(ties, self.settings)
         return self._said[1]
 
     def _links(self, hand: Hand | None, turn: Transform | None = None) -> dict[str, Link]:

@@ -68,8 +68,8 @@ def _errors(axes: Any, validation: Validation) -> None:
 
 def _plane(axes: Any, validation: Validation) -> None:
     hand = validation.hand
-    reference, moving = validation.ties.arrays()
-    offsets = reference - moving
+    reference, _ = validation.ties.arrays()
+    offsets = reference - validation.moving
     centre = np.array([hand.east, hand.north])
     agree = offsets[hand.inliers]
     answered = [e["offset"] for *_, e in answers(validation) if e["offset"] is not None]
@@ -108,10 +108,13 @@ def _circle(axes: Any, centre: Any, radius: float) -> None:
 def _places(axes: Any, validation: Validation) -> None:
     """Draw each pair's residual as an arrow: after registration, or else from the hand's offset."""
     hand = validation.hand
-    reference, moving = validation.ties.arrays()
+    reference, _ = validation.ties.arrays()
     left, name = validation.after, "after registration"
     if left is None:
-        left, name = reference - moving - [hand.east, hand.north], "from the hand's offset"
+        left, name = (
+            reference - validation.moving - [hand.east, hand.north],
+            "from the hand's offset",
+        )
     corner = np.floor(reference.min(axis=0))
     at = reference - corner
     # ten percent of the plot is a round length somewhat above the typical residual

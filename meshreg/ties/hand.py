@@ -7,6 +7,7 @@ rejected "in the same way" as III-B does, and the mean residual given with the o
 from __future__ import annotations
 
 import dataclasses
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,6 +20,8 @@ from meshreg.types import Bool, Float64, OffsetEstimate, Transform
 
 PAIRS = 25  # as many as the paper's authors picked at each site
 LEAST = 3  # fewer pairs cannot outvote a wrong one
+_BLOCK = 2.0  # m: within it the models bend alike
+MOST_LINES = 200  # pairs between which lines are drawn
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +110,7 @@ def hand_registration(
     return Hand(
         found.east,
         found.north,
-        sift.spread(offsets[inliers], reference[inliers]),
+        _spread(offsets[inliers], reference[inliers]),
         moving[inliers].mean(axis=0),
         inliers,
         np.hypot(*(offsets - [found.east, found.north]).T),
@@ -117,6 +120,14 @@ def hand_registration(
     )
 
 
+def _spread(offsets: Float64, places: Float64) -> Float64:
+    """(2, 2) covariance of the mean offset: pairs in one block of `_BLOCK` metres err alike."""
+    if len(offsets) < LEAST:
+        return 0.2**2 * np.eye(2)
+    blocks = len(np.unique(np.floor(places / _BLOCK), axis=0))
+    return np.asarray(np.cov(offsets.T) / blocks + 0.001**2 * np.eye(2))
+
+
 def ties_estimate(
     ties: TiePoints,
     settings: SiftSettings | None = None,
@@ -124,6 +135,9 @@ def ties_estimate(
     motion: Transform | None = None,
 ) -> OffsetEstimate:
     """Return the pairs as one more method's answer, marked as manual.
+
+    Its covariance is that of a single pair and more: what one person misjudges alike in all pairs
+    does not show in the scatter of their mean, and must not outweigh what was measured.
 
     Parameters
     ----------
@@ -145,6 +159,7 @@ def ties_estimate(
         "inliers": hand.inliers,
     }
     agree = int(hand.inliers.sum())
+    sigma = agree * hand.sigma + (hand.radius / 4) ** 2 * np.eye(2)
     split = 2 * agree <= complete
     return OffsetEstimate(
         "ties",
@@ -152,36 +167,71 @@ def ties_estimate(
         f"only {agree} of {complete} pairs agree within {hand.radius:g} m" if split else "",
         hand.east,
         hand.north,
-        hand.sigma,
+        sigma,
         agree / complete,
         evidence=evidence,
         manual=True,
     )
 
 
-def turn_first(transform: Transform | None, ties: TiePoints, radius: float) -> Transform | None:
-    """Return a registration's turn and scale about the pairs' middle, if one offset cannot do.
+def free_hand(
+    ties: TiePoints, settings: SiftSettings | None = None, seed: int = 0
+) -> tuple[Hand | None, Transform | None]:
+    """Find the translation that most pairs share, after their own turn where none alone will do.
 
-    A translation alone, as the paper's, fits no survey that was delivered turned by degrees. Then
-    the turn is taken from the registration and the pairs say the offset only.
+    A translation, as the paper's, fits no survey that was delivered turned by degrees or in a wrong
+    scale. The turn comes from the pairs, not from a registration that they are to check.
 
     Parameters
     ----------
-    transform : Transform or None
-        `reference_from_moving`; None, nothing is known.
     ties : TiePoints
-    radius : float
-        Within which pairs agree [m]; half of it may be lost to the turn.
+    settings : SiftSettings, optional
+    seed : int
+        As of `hand_registration`.
+
+    Returns
+    -------
+    Hand or None
+    Transform or None
+        Turn and scale about the middle of the moving points, by which they were moved first; None
+        where the translation alone does as well, or half of the radius would not tell.
     """
+    options = settings or SiftSettings()
+    hand = hand_registration(ties, options, seed)
+    if hand is None:
+        return None, None
+    turn = _own_turn(*ties.arrays(), np.random.default_rng(seed))
     _, moving = ties.arrays()
-    if transform is None or len(moving) < LEAST:
+    if turn is None or _longest(moved(moving, turn) - moving) <= options.inlier_radius / 2:
+        return hand, None
+    turned = hand_registration(ties, options, seed, turn)
+    if turned is None or turned.inliers.sum() <= hand.inliers.sum():
+        return hand, None
+    return turned, turn
+
+
+def _own_turn(reference: Float64, moving: Float64, rng: np.random.Generator) -> Transform | None:
+    """Median turn and scale of the longer lines between pairs: a quarter of them may be wrong."""
+    if len(moving) > MOST_LINES:
+        some = rng.choice(len(moving), MOST_LINES, replace=False)
+        reference, moving = reference[some], moving[some]
+    i, j = np.triu_indices(len(moving), 1)
+    here, there = (points[j] - points[i] for points in (reference, moving))
+    lengths = np.minimum(np.hypot(*here.T), np.hypot(*there.T))
+    long = (lengths >= np.median(lengths)) & (lengths > 0)
+    if not long.any():
         return None
-    middle = moving.mean(axis=0)
-    away = np.column_stack([moving - middle, np.zeros(len(moving))])
-    bent = np.hypot(*((away @ transform.linear.T - away)[:, :2]).T)
-    if bent.max() <= radius / 2:
-        return None
-    return Transform(transform.rotation, transform.scale, np.zeros(3), np.append(middle, 0.0))
+    ratio = (here[long] @ [1, 1j]) / (there[long] @ [1, 1j])
+    about = np.angle(np.sum(ratio / np.abs(ratio)))  # so that a half turn is not cut in two
+    angle = about + np.median(np.angle(ratio * np.exp(-1j * about)))
+    c, s = np.cos(angle), np.sin(angle)
+    rotation = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    scale = float(np.median(np.abs(ratio)))
+    return Transform(rotation, scale, np.zeros(3), np.append(moving.mean(axis=0), 0.0))
+
+
+def _longest(steps: Float64) -> float:
+    return float(np.hypot(*steps.T).max(initial=0.0))
 
 
 def moved(points: Float64, motion: Transform | None) -> Float64:
@@ -192,58 +242,11 @@ def moved(points: Float64, motion: Transform | None) -> Float64:
     return motion.apply(np.column_stack([points, level]))[:, :2]
 
 
-@dataclass(frozen=True)
-class Sector:
-    """One ninth of the overlap's bounding box.
-
-    `share` is how much of the overlap lies in it, `pairs` how many agreeing pairs.
-    """
-
-    name: str
-    share: float
-    pairs: int
-
-
-_NAMES = (
-    ("north-west", "north", "north-east"),
-    ("west", "middle", "east"),
-    ("south-west", "south", "south-east"),
-)
-
-
-def sectors(places: Float64, overlap: Float64) -> tuple[Sector, ...]:
-    """Count points by ninths of the ground that both surveys show.
-
-    Parameters
-    ----------
-    places : (N, 2) float64
-        Reference points [m].
-    overlap : (M, 2) float64
-        Centres of equal cells of the ground that both surveys show [m].
-    """
-    if not len(overlap):
-        return ()
-    low, high = overlap.min(axis=0), overlap.max(axis=0)
-    size = np.maximum(high - low, 1e-9)
-
-    def ninths(points: Float64) -> Any:
-        column = np.clip(3 * (points[:, 0] - low[0]) / size[0], 0, 2).astype(int)
-        row = np.clip(3 * (high[1] - points[:, 1]) / size[1], 0, 2).astype(int)
-        return np.bincount(3 * row + column, minlength=9).reshape(3, 3)
-
-    ground = ninths(overlap) / len(overlap)
-    inside = (places >= low - size / 20).all(axis=1) & (places <= high + size / 20).all(axis=1)
-    counts = ninths(places[inside])
-    return tuple(
-        Sector(_NAMES[row][col], float(ground[row, col]), int(counts[row, col]))
-        for row in range(3)
-        for col in range(3)
-    )
-
-
-def weak_spots(parts: tuple[Sector, ...], least_share: float = 0.04) -> tuple[str, ...]:
-    """Name the ninths that hold ground but no point; those of little ground are passed over."""
-    return tuple(part.name for part in parts if part.share >= least_share and not part.pairs)
+def turn_degrees(turn: Transform | None) -> float | None:
+    """Return the turn of a motion about the vertical [degrees, counterclockwise]."""
+    if turn is None:
+        return None
+    return math.degrees(math.atan2(turn.rotation[1, 0], turn.rotation[0, 0]))
 
 
 def hand_document(hand: Hand) -> dict[str, Any]:

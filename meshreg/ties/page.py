@@ -22,6 +22,7 @@ h1 { font-size: 1.5rem; margin: 0 0 .6rem; } h2 { font-size: 1.15rem; margin: 2r
   border-radius: 6px; margin: 0 0 1rem; }
 .verdict.yes { border-color: var(--good); }
 .verdict strong { color: var(--bad); } .verdict.yes strong { color: var(--good); }
+a { color: inherit; } a:focus-visible { outline: 3px solid var(--good); outline-offset: 2px; }
 .scroll { overflow-x: auto; }
 table { border-collapse: collapse; font-size: .92rem; font-variant-numeric: tabular-nums; }
 th, td { text-align: left; padding: .25rem .9rem .25rem 0; border-bottom: 1px solid var(--line);
@@ -54,6 +55,7 @@ def validation_page(
     policy = f"default-src 'none'; img-src data:; style-src 'sha256-{digest}'"
     title = f"Validation: {names[1]} on {names[0]}"
     parts = [
+        '<p class="note"><a href="report.html">Report of the registration</a></p>'
         f"<h1>{escape(title)}</h1>",
         _verdict(document),
         f'<div class="figures">{"".join(_figure(*item) for item in figures.items())}</div>',
@@ -91,13 +93,28 @@ def _figure(name: str, png: bytes) -> str:
 
 def sentence(document: Mapping[str, Any]) -> str:
     """Say in one sentence what the pairs make of the registration."""
+    said = _compared(document)
+    if document["ties"].get("independent", True):
+        return said
+    return f"{said}; but these pairs took part in the registration and do not check it"
+
+
+def _compared(document: Mapping[str, Any]) -> str:
     hand, fused = document["hand"], document["fused"]
     agree = f"{hand['inliers']} of {hand['pairs']} pairs agree within {hand['radius']:g} m"
+    if document["turned_first"] is not None:
+        agree += f" once they are turned by {document['turned_first']:+.2f}°"
     if hand["contradictory"]:
         return f"the pairs contradict one another: only {agree}"
     if fused["error"] is None:
         return f"there is no registered survey to compare; {agree}"
     sigmas = "" if fused["sigmas"] is None else f", {fused['sigmas']:.1f} sigma"
+    if fused["error"] <= hand["radius"] and 2 * fused["within"] <= hand["inliers"]:
+        return (
+            f"the result lies {fused['error']:.3f} m from the hand registration in their middle, "
+            f"but only {fused['within']} of the {hand['inliers']} pairs that agree are within "
+            f"{hand['radius']:g} m after registration: its turn is wrong"
+        )
     return (
         f"the result lies {fused['error']:.3f} m from the hand registration{sigmas}; {agree}, "
         f"with a mean residual of {fused['residual_inliers']:.3f} m after registration"
@@ -107,10 +124,16 @@ def sentence(document: Mapping[str, Any]) -> str:
 def methods_text(document: Mapping[str, Any]) -> str:
     """Return a paragraph for a methods section."""
     hand = document["hand"]
+    first = ""
+    if document["turned_first"] is not None:
+        first = (
+            f", after the turn of {document['turned_first']:+.2f}° and the scale of "
+            f"{document['scaled_first']:.4f} about their middle that they share,"
+        )
     return (
         f"The registration was checked against {hand['pairs']} points picked by hand in both "
-        "surveys. Their common translation was found by RANSAC (Bryson et al., 2013, section "
-        f"III-B: {hand['draws']} draws of {hand['sample']} pairs, inliers within "
+        f"surveys. Their common translation{first} was found by RANSAC (Bryson et al., 2013, "
+        f"section III-B: {hand['draws']} draws of {hand['sample']} pairs, inliers within "
         f"{hand['radius']:g} m): {hand['east']:+.3f} m east and {hand['north']:+.3f} m north, "
         f"with {hand['inliers']} inliers and a mean residual of {hand['residual']:.3f} m over all "
         f"pairs ({hand['residual_inliers']:.3f} m over the inliers)."
@@ -139,8 +162,10 @@ def _hand(document: Mapping[str, Any]) -> str:
     )
     if document["turned_first"] is not None:
         note += (
-            '<p class="note">The moving survey was delivered turned; its points were turned by '
-            f"{document['turned_first']:+.2f}° first, as the registration says.</p>"
+            '<p class="note">One translation does not fit these pairs: the moving points were '
+            f"turned by {document['turned_first']:+.2f}° and scaled by "
+            f"{document['scaled_first']:.4f} about their middle first, as the pairs themselves "
+            "say. The offset is of the middle.</p>"
         )
     return _table((), rows) + note
 
@@ -148,14 +173,20 @@ def _hand(document: Mapping[str, Any]) -> str:
 def _answers(document: Mapping[str, Any]) -> str:
     rows = []
     for method, entry in document["methods"].items():
-        name = method_name(method) + (" (picked by hand)" if entry["manual"] else "")
-        rows.append((name, entry["status"], *_offset(entry)))
+        rows.append((method_name(method), entry["status"], *_offset(entry)))
     rows.append(("result", document["fused"]["verdict"], *_offset(document["fused"])))
     head = ("answer", "says", "east [m]", "north [m]", "difference east", "north", "error [m]")
     note = (
-        '<p class="note">Methods state their offset for the whole overlap; the result is taken at '
-        "the middle of the agreeing pairs, its turn included.</p>"
+        '<p class="note">All answers are taken at the middle of the agreeing pairs, the turn of '
+        "the result included. The methods know no turn of their own and state one offset for the "
+        "whole overlap"
     )
+    if document["methods_turned"] is not None:
+        note += (
+            f"; they looked at the moving survey turned by {document['methods_turned']:+.2f}° "
+            "about its centre, which is undone here"
+        )
+    note += ".</p>"
     return _table(head, rows) + note
 
 

@@ -188,7 +188,7 @@ def only_one(path: Path) -> Iterator[None]:
 
 def _point(pairs: Pairs, values: Mapping[str, Any]) -> Pairs:
     """Give the open pair its point of one side; without an open pair, open a new one."""
-    side, point = _side(values), _place(values)
+    side, point = _side(values), as_place(values)
     for pair in pairs:
         if not pair.complete:
             return _replaced(pairs, _with_point(pair, side, point))
@@ -208,7 +208,7 @@ def _move(pairs: Pairs, values: Mapping[str, Any]) -> Pairs:
     pair, side = _find(pairs, values), _side(values)
     if getattr(pair, side) is None:
         raise UsageError(f"Pair {pair.id} has no {side} point to move.")
-    return _replaced(pairs, _with_point(pair, side, _place(values)))
+    return _replaced(pairs, _with_point(pair, side, as_place(values)))
 
 
 def _name(pairs: Pairs, values: Mapping[str, Any]) -> Pairs:
@@ -250,11 +250,18 @@ def _side(values: Mapping[str, Any]) -> str:
     return str(side)
 
 
-def _place(values: Mapping[str, Any]) -> Point:
+def as_place(values: Mapping[str, Any]) -> Point:
+    """Return a change's x and y [m], to a tenth of a millimetre.
+
+    Raises
+    ------
+    UsageError
+        They are no two numbers, or no place on earth.
+    """
     point = values.get("x"), values.get("y")
     if not all(isinstance(v, int | float) and not isinstance(v, bool) for v in point):
         raise UsageError(f"A point is two numbers, not {point}.")
+    if not all(abs(v) < 1e9 for v in point):  # type: ignore[arg-type]
+        raise UsageError("A point so far out is no place on earth.")
     east, north = (round(float(v), 4) for v in point)  # type: ignore[arg-type]
-    if not max(abs(east), abs(north)) < 1e9:
-        raise UsageError(f"({east}, {north}) is no place on earth.")
     return east, north

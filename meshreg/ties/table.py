@@ -27,6 +27,7 @@ COLUMNS = (
     "crs",
 )
 MAX_BYTES = 16_000_000
+MAX_LINES = 100_000  # far more than pairs: cameras may stand before the markers
 _EXPORT = "Save it as comma-separated text in UTF-8."
 IsHeader = Callable[[Sequence[str]], bool]
 Row = tuple[int, Mapping[str, str]]  # line of the file, and its values by column
@@ -123,9 +124,12 @@ def _point(path: Path, line: int, row: Mapping[str, str], which: str) -> Point |
 
 
 def number(path: Path, line: int, text: str, what: str) -> float:
-    """Read one coordinate, or say where it is none."""
+    """Read one coordinate, or say where it is none; the decimal sign may be a comma."""
+    plain = text.strip()
+    if plain.count(",") == 1 and "." not in plain:  # spreadsheets of half of Europe
+        plain = plain.replace(",", ".")
     try:
-        value = float(text)
+        value = float(plain)
     except ValueError:
         value = float("nan")
     if not abs(value) < 1e9:
@@ -144,7 +148,8 @@ def read_table(path: Path, is_header: IsHeader) -> tuple[tuple[str, ...], list[R
     is_header : callable
         Whether a line's names are the columns that are looked for. It is tried with comma,
         semicolon, tab and space as the delimiter; what stands before the header, empty lines and
-        comments (`#`) are skipped.
+        comments (`#`) are skipped. A comment that starts with the header's own first column is
+        the head of another table in the same file, which is passed over.
 
     Returns
     -------
@@ -157,7 +162,9 @@ def read_table(path: Path, is_header: IsHeader) -> tuple[tuple[str, ...], list[R
     InputError
         Too large, no text, or a line of more values than columns.
     """
-    lines = read_lines(path)
+    lines = read_text(path).splitlines()
+    if len(lines) > MAX_LINES:
+        raise InputError(f"has {len(lines)} lines; {MAX_LINES} are the limit.", file=path)
     for delimiter in ",;\t ":
         header, rows = _parsed(path, lines, delimiter, is_header)
         if header:
@@ -167,14 +174,14 @@ def read_table(path: Path, is_header: IsHeader) -> tuple[tuple[str, ...], list[R
     return (), []
 
 
-def read_lines(path: Path) -> list[str]:
-    """Return the lines of a text file of points."""
+def read_text(path: Path, limit: int = MAX_BYTES) -> str:
+    """Return a text file of points, if it has no more than `limit` bytes."""
     with open_regular(path) as stream:
-        data = stream.read(MAX_BYTES + 1)
-    if len(data) > MAX_BYTES:
-        raise InputError(f"is larger than {MAX_BYTES} bytes; that is no table.", file=path)
+        data = stream.read(limit + 1)
+    if len(data) > limit:
+        raise InputError(f"is larger than {limit} bytes; no table of points is.", file=path)
     try:
-        return data.decode("utf-8-sig").splitlines()
+        return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise InputError(
             f"is no UTF-8 text ({error.reason}).", file=path, remedy=_EXPORT
@@ -186,16 +193,23 @@ def _parsed(
 ) -> tuple[tuple[str, ...], list[Row]]:
     header: tuple[str, ...] = ()
     rows: list[Row] = []
+    other = False
     for line, text in enumerate(lines, 1):
         if not text.strip():
             continue
         comment = text.lstrip().startswith("#")
         if comment or not header:
-            names = tuple(name.strip().lower() for name in _cells(text.lstrip("# "), delimiter))
+            cells = _cells(path, line, text.lstrip("# "), delimiter)
+            names = tuple(name.strip().lower() for name in cells)
             if is_header(names):
-                header, rows = names, []  # Metashape writes cameras first, then markers
+                # Metashape writes cameras first, then markers, then scale bars
+                header, rows, other = names, [], False
+            elif header and names[:1] == header[:1]:
+                other = True
             continue
-        cells = _cells(text, delimiter)
+        if other:
+            continue
+        cells = _cells(path, line, text, delimiter)
         if len(cells) > len(header) and any(cells[len(header) :]):
             raise InputError(
                 f"has {len(cells)} values for {len(header)} columns.",
@@ -207,5 +221,8 @@ def _parsed(
     return header, rows
 
 
-def _cells(text: str, delimiter: str) -> list[str]:
-    return next(csv.reader([text], delimiter=delimiter, skipinitialspace=True), [])
+def _cells(path: Path, line: int, text: str, delimiter: str) -> list[str]:
+    try:
+        return next(csv.reader([text], delimiter=delimiter, skipinitialspace=True), [])
+    except csv.Error as error:  # a value of more than 131,072 characters
+        raise InputError(f"cannot be read: {error}.", file=path, place=f"line {line}") from error

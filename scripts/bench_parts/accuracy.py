@@ -2,6 +2,10 @@
 
 Drawn anew for each pair: offset within 3 m east and north, yaw within half a degree, navigation
 and light as in the recipe `severity`. DEM cells of 0.10 m, orthomosaic 0.05 m.
+
+Where the models bend, `--warp auto` is measured too: what is left between where it puts each place
+of the overlap, on a lattice of 0.25 m, and where that belongs. All of the overlap counts, changed
+ground included, since the truth is where the rock went and not what grew on it.
 """
 
 from __future__ import annotations
@@ -9,6 +13,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+
+from meshreg.types import Grid, SurveyRaster, Transform
 
 PAIRS = 6
 OFFSETS = {
@@ -28,6 +35,7 @@ def one(case: str, changes: dict[str, Any], seed: int) -> dict[str, Any]:
     """Register one pair of rasters; return its errors."""
     from data_synth.rasters import make_rasters
     from data_synth.recipe import load
+    from data_synth.truth import common_points
     from meshreg.benchmark.measure import of_decision, register_rasters
     from meshreg.settings import Settings
 
@@ -47,7 +55,62 @@ def one(case: str, changes: dict[str, Any], seed: int) -> dict[str, Any]:
         "covered": fused.get("covered", False),
         "yaw": abs(np.rad2deg(turn)),
         "verdict": fused["verdict"],
+        "warped": warped(decision, pairs["dem"], common_points(made.scene, 0.25))
+        if changes["sfm.warp"]
+        else None,
     }
+
+
+def warped(
+    decision: Any, dems: tuple[SurveyRaster, SurveyRaster], points: tuple[Any, Any]
+) -> dict[str, Any] | None:
+    """Bend a registered pair as `--warp auto` does; residuals at (moving, reference) points [m]."""
+    from meshreg import statistics
+    from meshreg.raster.grid import common_grid
+    from meshreg.settings import WarpSettings
+    from meshreg.warp import measure
+
+    transform, refined = decision.transform, decision.refined
+    if transform is None:
+        return None
+    grid = common_grid(dems[0].grid, dems[1].grid)
+    reference, moving = statistics.on_grid(dems[0], grid), laid_down(dems[1], grid, transform)
+    found = measure(refined.tiles, transform, reference, moving, WarpSettings("auto"))
+    there = transform.apply(points[0])
+    after = there if found.warp is None else found.warp.apply(there)
+    parts = [found.record.get(name) or {} for name in ("horizontal", "vertical")]
+    return {
+        "before": apart(there, points[1]),
+        "after": apart(after, points[1]),
+        "models": "/".join(part.get("allowed", "none") for part in parts),
+        "strain": max(part.get("strain", 0.0) for part in parts),
+        "refused": any(part and part["allowed"] != part["model"] for part in parts),
+    }
+
+
+def laid_down(dem: SurveyRaster, grid: Grid, transform: Transform) -> SurveyRaster:
+    """Lay a DEM down as a surface: a raster alone cannot be tilted."""
+    from meshreg.raster import rasterize
+    from meshreg.settings import RasterSettings
+    from meshreg.types import Mesh, Survey
+
+    row, col = np.indices(dem.grid.shape)
+    height = np.where(dem.valid, dem.height + dem.datum, 0.0)
+    places = np.stack([*dem.grid.east_north(row.ravel(), col.ravel()), height.ravel()], axis=1)
+    number = row * dem.grid.shape[1] + col
+    corners = [np.s_[:-1, :-1], np.s_[1:, :-1], np.s_[:-1, 1:], np.s_[1:, 1:]]
+    whole = np.logical_and.reduce([dem.valid[c] for c in corners])
+    a, b, c, d = (number[corner][whole] for corner in corners)
+    faces = np.concatenate([np.stack([a, b, c], axis=1), np.stack([b, d, c], axis=1)])
+    plain = RasterSettings(remove_floaters=False)
+    return rasterize(Survey("moving", Mesh(places, faces)), grid, plain, transform=transform)
+
+
+def apart(found: NDArray[np.float64], true: NDArray[np.float64]) -> tuple[float, float]:
+    """Root mean square residual, horizontal and vertical [mm]."""
+    left = 1e3 * (found - true)
+    flat, up = (left[:, :2] ** 2).sum(axis=1), left[:, 2] ** 2
+    return float(np.sqrt(flat.mean())), float(np.sqrt(up.mean()))
 
 
 def bench() -> list[dict[str, Any]]:
@@ -66,7 +129,26 @@ def bench() -> list[dict[str, Any]]:
                 "95 % region covers": sum(bool(d["covered"]) for d in done),
             }
         )
+        rows[-1] |= residuals([d["warped"] for d in done if d["warped"]])
     return rows + steps_on_a_real_reef()
+
+
+def residuals(found: list[dict[str, Any]]) -> dict[str, Any]:
+    """Return what is left before and after the warp, as more columns of a case."""
+    if not found:
+        return {}
+    before, after = (np.array([f[when] for f in found]) for when in ("before", "after"))
+    models = [f["models"] for f in found]
+    strains = [100 * f["strain"] for f in found]
+    largest = after.max(axis=0)
+    return {
+        "rigid leaves mm (flat / up, median)": "{:.0f} / {:.0f}".format(*np.median(before, axis=0)),
+        "warp leaves mm (median)": "{:.1f} / {:.1f}".format(*np.median(after, axis=0)),
+        "warp leaves mm (largest)": f"{largest[0]:.1f} / {largest[1]:.1f}",
+        "models": ", ".join(f"{models.count(m)} {m}" for m in dict.fromkeys(models)),
+        "strain % (median, largest)": f"{np.median(strains):.2f}, {max(strains):.2f}",
+        "refused": f"{sum(f['refused'] for f in found)} of {len(found)}",
+    }
 
 
 def steps_on_a_real_reef() -> list[dict[str, Any]]:

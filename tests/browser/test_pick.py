@@ -228,8 +228,13 @@ def test_25_pairs_clicked_give_the_true_offset(
     assert document["fused"]["error"] == pytest.approx(0.05, abs=0.02)
     assert 0.005 < document["hand"]["residual_inliers"] < 0.03
 
-    page.goto((out / "validation.html").as_uri())
+    page.goto((out / "report.html").as_uri())  # where a user finds it
+    assert "Confirmed by tie points" in page.locator("#verdict").text_content()
+    page.locator("#verdict a", has_text="comparison").click()
+    assert page.url == (out / "validation.html").as_uri()
     assert "Confirmed" in page.locator(".verdict").text_content()
+    page.locator("a", has_text="Report").click()
+    assert page.url == (out / "report.html").as_uri()
 
 
 def test_reload_resumes_and_changes_can_be_taken_back(
@@ -291,6 +296,43 @@ def test_keys_alone_can_pick(running: Running, browser_page: Any) -> None:
     page.keyboard.press("Delete")
     settled(page, before)
     assert read_ties(running.ties).pairs == ()
+
+
+def test_the_magnifier_makes_way_and_the_focus_is_seen(running: Running, browser_page: Any) -> None:
+    page = opened(browser_page, running.url)
+    lens = page.locator("#reference .lens")
+    box = page.locator("#reference").bounding_box()
+
+    def left_edge(x: float, y: float) -> float:
+        page.mouse.move(box["x"] + x * box["width"], box["y"] + y * box["height"])
+        page.wait_for_timeout(50)
+        return float(lens.bounding_box()["x"] - box["x"])
+
+    assert left_edge(0.5, 0.3) > 0.5 * box["width"]
+    assert left_edge(0.9, 0.95) < 0.2 * box["width"]  # it would hide what is pointed at
+    assert left_edge(0.1, 0.95) > 0.5 * box["width"]
+    page.keyboard.press("m")
+    assert not lens.is_visible()
+
+    # every control can be reached by Tab, has a name, and shows the focus
+    page.locator("#undo").evaluate("(button) => { button.disabled = false; button.focus(); }")
+    seen = []
+    for _ in range(12):
+        page.keyboard.press("Tab")
+        seen.append(
+            page.evaluate(
+                """() => {
+                const at = document.activeElement, style = getComputedStyle(at);
+                const above = getComputedStyle(at, "::before");
+                const name = at.getAttribute("aria-label") || at.title
+                  || at.labels?.[0]?.textContent || at.textContent;
+                return [at.id || at.className, name.trim(),
+                  style.outlineStyle !== "none" || above.boxShadow !== "none"];
+                }"""
+            )
+        )
+    assert {"lens", "hint", "help-button", "reference", "moving"} <= {name for name, *_ in seen}
+    assert all(name and marked for where_, name, marked in seen if where_)
 
 
 def test_pictures_move_together(running: Running, browser_page: Any, pair: RasterPair) -> None:

@@ -128,6 +128,19 @@ def test_flicker_shows_one_after_the_other(browser_page: Any, pages: dict[str, s
     assert stage.get_attribute("data-shown") == "swipe"
 
 
+def test_dark_mosaics_can_be_brightened(browser_page: Any, pages: dict[str, str]) -> None:
+    browser_page.goto(pages["accepted"])
+    button = browser_page.locator("#mosaics [data-bright]")
+    means = []
+    for pressed in ("false", "true", "false"):
+        assert button.get_attribute("aria-pressed") == pressed
+        means.append(pixels(browser_page, MOSAICS)[80:, 100:-100].mean())
+        button.click()
+    assert means[1] > 1.15 * means[0]
+    assert means[2] == pytest.approx(means[0], rel=0.01)
+    assert browser_page.locator("#relief [data-bright]").count() == 0
+
+
 def test_after_registration_both_pictures_agree(browser_page: Any, pages: dict[str, str]) -> None:
     browser_page.goto(pages["accepted"])
     stage = browser_page.locator(MOSAICS)

@@ -157,6 +157,15 @@ def top_area(mesh: Mesh) -> float:
     return len(np.unique(np.floor(mesh.vertices[low, :2] / 0.1), axis=0)) * 0.01
 
 
+def test_origin_is_never_minus_zero():
+    """Its height is 0 times a depth, and -0.0 is written as such into sidecars and records."""
+    pair = make_pair(recipe(), 5, SIZE, "ply-cloud")
+    assert pair.scene.reference.distortion.start[2] < 0
+    for survey in (pair.reference, pair.moving):
+        assert survey.origin[2] == 0.0
+        assert not np.signbit(survey.origin[2])
+
+
 def test_rasters_agree_with_the_mesh():
     """The short way and the files show one seafloor, in place to the centimetre."""
     pair = make_rasters(recipe(), 5, SIZE, 0.10, 0.05)

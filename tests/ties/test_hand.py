@@ -21,10 +21,12 @@ from meshreg.io import document as document_module
 from meshreg.io.document import read_registration, registration_document, to_json
 from meshreg.settings import Settings, SiftSettings
 from meshreg.ties import TiePair, TiePoints, hand_registration, ties_estimate, write_ties
-from meshreg.ties.hand import sectors, weak_spots
+from meshreg.ties.cover import sectors, weak_spots
+from meshreg.ties.hand import free_hand, turn_degrees
+from meshreg.ties.page import sentence
 from meshreg.ties.placing import Placing
 from meshreg.ties.validate import validate
-from meshreg.types import Transform
+from meshreg.types import OffsetEstimate, Transform
 
 OFFSET = np.array([1.7, -0.9])
 
@@ -105,6 +107,43 @@ def test_pairs_of_chance_are_weak_and_open_ones_are_not_counted():
     assert hand_registration(ties).contradictory
 
 
+def turned(moving, degrees, scale=1.0):
+    c, s = scale * math.cos(math.radians(degrees)), scale * math.sin(math.radians(degrees))
+    middle = moving.mean(axis=0)
+    return (moving - middle) @ np.array([[c, s], [-s, c]]) + middle
+
+
+@pytest.mark.parametrize("wrong", [0, 5])
+@pytest.mark.parametrize(("degrees", "scale"), [(12.0, 1.0), (-170.0, 1.0), (179.9, 0.9)])
+def test_pairs_know_their_own_turn(degrees, scale, wrong):
+    reference, moving = clicked(6, wrong=wrong, noise=0.01)
+    delivered = turned(moving, -degrees, 1 / scale)
+    assert hand_registration(picked(reference, delivered)).contradictory
+    hand, turn = free_hand(picked(reference, delivered))
+    assert not hand.inliers[:wrong].any()
+    assert hand.inliers[wrong:].all()
+    difference = (turn_degrees(turn) - degrees + 180) % 360 - 180
+    assert difference == pytest.approx(0, abs=0.4)
+    assert turn.scale == pytest.approx(scale, abs=0.005)
+    # the true translation in the pairs' middle, where an error of the turn does nothing
+    assert (hand.east, hand.north) == pytest.approx(OFFSET, abs=0.02)
+
+
+def test_a_translation_that_does_is_left_alone():
+    for yaw in (0.0, 0.3):  # 6 m from the middle 0.3 degrees are 3 cm
+        reference, moving = clicked(3, wrong=4)
+        ties = picked(reference, turned(moving, yaw))
+        hand, turn = free_hand(ties)
+        assert turn is None
+        assert (hand.east, hand.north) == (
+            hand_registration(ties).east,
+            hand_registration(ties).north,
+        )
+    assert free_hand(picked(*clicked(count=2))) == (None, None)
+    same = picked([(1.0, 1.0)] * 4, [(0.0, 0.0)] * 4)  # no line between any two
+    assert free_hand(same)[1] is None
+
+
 def test_weak_spots_are_named_by_the_compass():
     east, north = np.meshgrid(np.arange(0.5, 12), np.arange(0.5, 12))
     ground = np.column_stack([east.ravel(), north.ravel()])
@@ -158,6 +197,49 @@ def test_a_survey_delivered_turned_is_turned_first():
     assert found["turned_first"] == pytest.approx(20)
     assert found["fused"]["error"] == pytest.approx(0.05, abs=1e-6)
     assert found["confirmed"]
+
+
+@pytest.mark.parametrize("seen", [None, (19.8, 1.0)])
+def test_methods_are_compared_in_the_frame_that_they_looked_at(seen):
+    """Their offsets are of the survey as it was turned about its centre: by the result's own turn,
+    or by what the evidence says that they saw."""
+    registration, reference, moving = made(yaw=math.radians(20))
+    ties = picked(reference, moving)
+    centre = registration.transform.pivot[:2]
+    c, s = (f(math.radians(20 if seen is None else seen[0])) for f in (math.cos, math.sin))
+    looked_at = (moving - centre) @ np.array([[c, s], [-s, c]]) + centre
+    # truth: the mean offset of what the method looked at, and an error that is put in
+    true = (reference - looked_at).mean(axis=0)
+    error = np.array([0.06, -0.02])
+    estimate = OffsetEstimate("terrain", "ok", "", *(true + error))
+    registration = dataclasses.replace(registration, estimates=(estimate,))
+    found = validate(registration, ties, Placing(registration), turned=seen).document
+    method = found["methods"]["terrain"]
+    assert method["difference"] == pytest.approx(error, abs=1e-9)
+    assert method["error"] == pytest.approx(np.hypot(*error))
+    hand = np.array([found["hand"]["east"], found["hand"]["north"]])
+    assert method["offset"] == pytest.approx(hand + error)
+    assert found["methods_turned"] == pytest.approx(20 if seen is None else seen[0])
+
+
+def test_a_wrong_turn_is_not_confirmed_though_it_is_right_in_the_middle():
+    registration, reference, moving = made(yaw=math.radians(2))
+    middle = np.append(moving.mean(axis=0), registration.transform.pivot[2])
+    # the same place for the middle, three degrees too far
+    c, s = math.cos(math.radians(3)), math.sin(math.radians(3))
+    more = Transform(
+        np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]]),
+        pivot=registration.transform.apply(middle),
+    )
+    wrong = dataclasses.replace(registration, transform=more @ registration.transform)
+    document = validate(wrong, picked(reference, moving), Placing(wrong)).document
+    assert document["fused"]["error"] < 1e-6
+    assert document["fused"]["residual"] > 0.2
+    assert not document["confirmed"]
+    assert "its turn is wrong" in sentence(document)
+    right = validate(registration, picked(reference, moving), Placing(registration)).document
+    assert right["confirmed"]
+    assert right["fused"]["within"] == 25
 
 
 def test_a_rejected_registration_has_methods_only():
@@ -243,6 +325,15 @@ def test_wrong_ties_move_nothing(rasters, offset):
         assert "outside the search radius" in wrong.estimates[-1].reason
 
 
+def test_a_person_s_bias_does_not_outweigh_what_was_measured(rasters):
+    """Pairs that agree to a centimetre, all wrong alike, and near enough to be of one mind."""
+    found = decided(rasters, (TRUE[0] + 0.15, TRUE[1] + 0.1), 60)
+    best = found.judgement.best
+    assert "ties" in best.methods
+    assert math.hypot(best.east - TRUE[0], best.north - TRUE[1]) < 0.03
+    assert np.linalg.eigvalsh(found.estimates[-1].sigma).min() > 0.05**2
+
+
 def test_ties_do_not_make_another_place_acceptable():
     here = seafloor.rasters(2, TRUE, half=7.0, size=20.0)
     there = seafloor.rasters(102, TRUE, half=7.0, size=20.0)
@@ -288,12 +379,23 @@ def test_validate_writes_page_figures_and_document(tmp_path, capsys):
     assert "<script" not in page
     assert "&lt;script&gt;" in page
     assert page.count("data:image/png") == 3
+    assert '<a href="report.html">' in page
     assert "http" not in page.split("<body>")[1]
     drawn = {path.name for path in (out / "figures").iterdir()}
     assert drawn == {f"validation_{n}.png" for n in ("errors", "offsets", "residuals")}
 
     assert cli.run(["validate", str(out), str(tmp_path / "ties.csv"), "--json"]) == 0
     assert json.loads(capsys.readouterr().out) == document
+
+    # the report leads there, and does so when it is made again
+    for again in (False, True):
+        if again:
+            assert cli.run(["report", str(out)]) == 0
+            capsys.readouterr()
+        report = (out / "report.html").read_text()
+        assert "Confirmed by tie points picked by hand" in report
+        assert document["said"] in report
+        assert '<a href="validation.html">' in report
 
     # pairs that took part are no check, and that is said
     digest = document["ties"]["sha256"][0]
@@ -302,11 +404,13 @@ def test_validate_writes_page_figures_and_document(tmp_path, capsys):
     (out / "registration.json").write_text(to_json(registration_document(used)))
     assert cli.run(["validate", str(out), str(tmp_path / "ties.csv"), "--json"]) == 0
     assert not json.loads(capsys.readouterr().out)["ties"]["independent"]
-    assert "do not check it" in (out / "validation.html").read_text()
+    for page in ("validation.html", "report.html"):
+        assert "do not check it" in (out / page).read_text()
 
     far = picked(reference + np.array([0.5, 0.0]), moving, crs)
     write_ties(far, tmp_path / "ties.csv")
     assert cli.run(["validate", str(out), str(tmp_path / "ties.csv"), "--json"]) == 4
+    assert "Not confirmed by tie points" in (out / "report.html").read_text()
     write_ties(dataclasses.replace(far, crs="EPSG:3857"), tmp_path / "ties.csv")
     assert cli.run(["validate", str(out), str(tmp_path / "ties.csv")]) == 2
     assert cli.run(["validate", str(tmp_path / "none"), str(tmp_path / "ties.csv")]) == 2

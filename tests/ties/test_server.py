@@ -173,6 +173,23 @@ def test_the_hand_registration_follows_each_pair(client, desk):
     assert "middle" not in state["weak"]
 
 
+def test_a_survey_delivered_turned_is_laid_down_by_its_pairs(client, desk):
+    rng = np.random.default_rng(4)
+    moving = rng.uniform((502, 895), (507, 900), (8, 2))
+    c, s = np.cos(0.2), np.sin(0.2)
+    reference = (moving - [504, 897]) @ np.array([[c, s], [-s, c]]) + [504.3, 896.8]
+    for k in range(8):
+        for side, places in (("reference", reference), ("moving", moving)):
+            x, y = places[k].tolist()
+            change(client, desk.session.revision, "point", side=side, x=x, y=y)
+    state = client.get("/api/state").json()
+    assert state["turned"] == pytest.approx(np.rad2deg(0.2), abs=0.01)
+    assert state["hand"]["inliers"] == 8
+    assert state["hand"]["residual"] < 1e-3
+    assert state["links"]["pairs"]["angle"] == pytest.approx(0.2, abs=2e-4)
+    assert state["links"]["delivered"]["angle"] == 0
+
+
 def test_a_stale_change_is_refused_with_the_present_state(client, desk):
     change(client, 0, "point", side="reference", x=501, y=895)
     answer = change(client, 0, "point", side="reference", x=777, y=777)
@@ -191,6 +208,7 @@ def test_a_stale_change_is_refused_with_the_present_state(client, desk):
         '{"revision": 0, "what": "point", "side": "reference", "x": NaN, "y": 2}',
         '{"revision": 0, "what": "point", "side": "reference", "x": 1e300, "y": 2}',
         '{"revision": 0, "what": "point", "side": "reference", "x": true, "y": 2}',
+        '{"revision": 0, "what": "point", "side": "reference", "x": 1' + "0" * 400 + ', "y": 2}',
         '{"revision": 0, "what": "name", "id": 5, "name": "x"}',
         '{"revision": 0, "what": "undo"}',
         '{"revision": 0, "what": "point", "junk": "' + "x" * 20_000 + '"}',

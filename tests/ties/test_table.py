@@ -13,10 +13,11 @@ from hypothesis import strategies as st
 
 from meshreg.errors import InputError, OutputError, UsageError
 from meshreg.ties import TiePair, TiePoints, read_ties, write_ties
-from meshreg.ties.formats import Context, read_points
+from meshreg.ties.foreign import Context
+from meshreg.ties.formats import read_points
 
-METASHAPE = """\
-# CoordinateSystem: PROJCS["WGS 84 / UTM zone 55S",GEOGCS["WGS 84",AUTHORITY["EPSG","4326"]]]
+METASHAPE = f"""\
+#CoordinateSystem: {pyproj.CRS("EPSG:32755").to_wkt("WKT1_GDAL")}
 #Label,X/East,Y/North,Z/Altitude,Error_(m),X_error,Y_error,Z_error,X_est,Y_est,Z_est
 target 1,500000.000,6000000.000,-9.1,0.0,0,0,0,499998.750,6000000.500,-9.0
 target 2,500004.000,6000001.000,-9.2,0.0,0,0,0,500002.750,6000001.500,-9.1
@@ -142,6 +143,87 @@ def test_degrees_go_to_the_surveys_crs(tmp_path):
         read_points(",".join(map(str, files)), Context(None))
 
 
+# exportReference as ReefShape calls it, columns "nouvwUVW": the estimated coordinates alone
+ESTIMATED = (
+    "#Label,Enabled,X_est,Y_est,Z_est,X_error,Y_error,Z_error\ntarget 1,1,{},{},-9.1,0,0,0\n"
+)
+
+
+@pytest.mark.parametrize("said", [True, False])
+def test_an_export_of_estimates_in_degrees_is_no_offset_of_zero(tmp_path, said):
+    crs = "EPSG:32617"
+    wkt = pyproj.CRS("EPSG:4326").to_wkt("WKT1_GDAL")
+    head = f"#CoordinateSystem: {wkt}\n" if said else ""  # ReefShape takes that line away
+    places = [(250000.0, 2800000.0), (250001.5, 2800002.5)]
+    back = pyproj.Transformer.from_crs(crs, "EPSG:4326", always_xy=True)
+    files = [
+        written(
+            tmp_path / f"{k}.csv",
+            head + ESTIMATED.format(*(f"{v:.9f}" for v in back.transform(*place))),
+        )
+        for k, place in enumerate(places)
+    ]
+    found = read_points(",".join(map(str, files)), Context(crs))
+    assert np.allclose(found.pairs[0].reference, places[0], rtol=0, atol=2e-4)
+    assert np.allclose(found.pairs[0].moving, places[1], rtol=0, atol=2e-4)
+
+
+def test_markers_of_another_grid_are_moved_and_of_a_local_frame_are_not(tmp_path):
+    place, crs = (500000.0, 6000000.0), "EPSG:32755"
+    other = pyproj.Transformer.from_crs(crs, "EPSG:32754", always_xy=True)
+    wkt = pyproj.CRS("EPSG:32754").to_wkt("WKT1_GDAL")
+    rows = "{}#Label,X/East,Y/North,X_est,Y_est\na,{},{},{},{}\n"
+    text = rows.format(f"#CoordinateSystem: {wkt}\n", *(2 * other.transform(*place)))
+    found = read_points(written(tmp_path / "other.csv", text), Context(crs))
+    assert np.allclose(found.arrays(), [[place], [place]], rtol=0, atol=1e-3)
+    local = '#CoordinateSystem: LOCAL_CS["Local Coordinates (m)",UNIT["metre",1]]\n'
+    text = rows.format(local, 1, 2, 3, 4)
+    found = read_points(written(tmp_path / "local.csv", text), Context(None))
+    assert found.pairs[0].reference == (1.0, 2.0)
+    text = rows.format("#CoordinateSystem: PROJCS[nonsense]\n", 500000, 6000000, 500001, 6000000)
+    found = read_points(written(tmp_path / "odd.csv", text), Context(crs))
+    assert found.pairs[0].reference == (500000.0, 6000000.0)
+    assert "not understood" in found.notes[0]
+
+
+def test_cameras_before_and_scale_bars_after_the_markers_are_passed_over(tmp_path):
+    text = METASHAPE.replace(
+        "#Label",
+        "#Cameras\n#Label,X/East,Y/North,Yaw,Pitch,Roll,X_est,Y_est,Z_est\n"
+        "IMG_1.JPG,500001,6000001,0,0,0,500001,6000001,-5\n#Markers\n#Label",
+        1,
+    )
+    text += (
+        "#Scalebars\n#Label,Distance_(m),Error_(m),Distance_est\ntarget 1_target 2,0.5,0.1,0.6\n"
+    )
+    found = read_points(written(tmp_path / "all.csv", text), Context("EPSG:32755"))
+    assert [p.name for p in found.pairs] == ["target 1", "target 2"]
+
+
+def test_a_spreadsheet_with_decimal_commas(tmp_path):
+    text = "Label;X/East;Y/North;X_est;Y_est\nA;500000,25;6000000,5;500001,5;6000001,0\n"
+    found = read_points(written(tmp_path / "excel.csv", text))
+    assert found.pairs[0].reference == (500000.25, 6000000.5)
+    assert found.pairs[0].moving == (500001.5, 6000001.0)
+    text = 'Label,X,Y,X_est,Y_est\nA,"1,234.5",2,3,4\n'
+    with pytest.raises(InputError, match="no coordinate"):
+        read_points(written(tmp_path / "thousands.csv", text))
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("Label,X,Y\n" + "a" * 200_000 + ",1,2\n", "line 2"),
+        ("Label,X,Y\n" * 100_001, "are the limit"),
+        ("Label,X,Y\n" + "a,1,2\n" * 10_001, "are the limit"),
+        ("a" * 17_000_000, "larger than"),
+    ],
+)
+def test_hostile_tables_are_refused_at_once(tmp_path, text, said):
+    with pytest.raises(InputError, match=said):
+        read_points(written(tmp_path / "hostile.csv", text))
+
+
 TAGLAB = (
     "Image name,TagLab Id,TagLab Type,TagLab Date,TagLab Class name,TagLab Genet Id,"
     "TagLab Centroid x,TagLab Centroid y,TagLab Area,TagLab Note\n"
@@ -183,11 +265,24 @@ def test_taglab_project_markers(tmp_path):
         "type": [0, 1],
     }
     path = tmp_path / "project.json"
-    path.write_text(json.dumps({"images": [], "markers": {"a": {"b": {"markers": ends}}}}))
+    # millimetres: a pixel is 2 mm in one map, 0.5 mm in the other, written as text
+    images = [{"id": "a", "map_px_to_mm_factor": "2"}, {"id": "b", "map_px_to_mm_factor": 0.5}]
+    document = {"images": images, "markers": {"a": {"b": {"markers": ends}}}}
+    path.write_text(json.dumps(document))
     same = {"reference": lambda p: p, "moving": lambda p: p}
     found = read_points(path, Context(None, same))
     reference, moving = found.arrays()
-    assert np.array_equal(moving - reference, [[4, 4], [4, 4]])
+    assert np.array_equal(reference, [[0.5, 1], [1.5, 2]])
+    assert np.array_equal(moving, [[10, 12], [14, 16]])
+    assert any("'a' is taken as the reference" in note for note in found.notes)
+    for broken in ({**document, "images": []}, {**document, "images": [{"id": "a"}] * 2}):
+        path.write_text(json.dumps(broken))
+        with pytest.raises(InputError, match="there is no image"):
+            read_points(path, Context(None, same))
+    images[0]["map_px_to_mm_factor"] = "0"
+    path.write_text(json.dumps(document))
+    with pytest.raises(InputError, match="a size of 0"):
+        read_points(path, Context(None, same))
     path.write_text("{}")
     with pytest.raises(InputError, match="TagLab"):
         read_points(path)

@@ -122,7 +122,7 @@
     return made;
   }
 
-  const home = () => ({ turn: -0.5, tilt: 0.85, far: 1.6, x: 0.03, y: -0.06 });
+  const home = () => ({ turn: -0.5, tilt: 0.85, far: 1.85, x: 0.02, y: -0.04 });
   let eye = home();
   function camera() {
     const aspect = canvas.width / canvas.height, f = 1 / Math.tan(0.36) * Math.min(1, aspect);
@@ -135,7 +135,7 @@
     const rowsOf = [view[0].map((v) => v * f / aspect), view[1].map((v) => v * f), view[2].map((v, k) => v * a + (k === 3 ? b : 0)), view[2].map((v) => -v)];
     return new Float32Array([0, 1, 2, 3].flatMap((c) => rowsOf.map((row) => row[c])));
   }
-  const picked = (name) => document.querySelector(`[data-scene-tools] input[name="${name}"]:checked`).value;
+  const picked = (name) => document.querySelector(`[data-scene-tools] input[name="${name}"]:checked`)?.value;
   const stretcher = document.getElementById("stretch");
   let asked = false;
   function draw() { if (!asked) { asked = true; requestAnimationFrame(paint); } }

@@ -141,7 +141,7 @@
     const step = [1, 2, 5, 10].map((k) => k * power).find((s) => s >= rough);
     const digits = Math.max(0, -Math.floor(Math.log10(step) + 1e-9));
     const found = [];
-    for (let k = Math.ceil(low / step - 1e-9); k * step <= high + 1e-9 * step; k++) found.push([k * step, (k * step + 0).toFixed(digits)]);
+    for (let k = Math.ceil(low / step - 1e-9); k * step <= high + 1e-9 * step; k++) found.push([k * step, (k * step + 0).toFixed(digits).replace("-", "\u2212")]);
     return found;
   }
 

@@ -103,6 +103,10 @@
       input.addEventListener("change", () => choose(input.value));
     }
     flicker.addEventListener("click", flick);
+    const bright = box.querySelector("[data-bright]");
+    if (bright) bright.addEventListener("click", () => {
+      bright.setAttribute("aria-pressed", String(stage.classList.toggle("bright")));
+    });
     const acts = { in: () => zoom(1.5), out: () => zoom(1 / 1.5), reset };
     for (const button of box.querySelectorAll("[data-act]")) {
       button.addEventListener("click", acts[button.dataset.act]);

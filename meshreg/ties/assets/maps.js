@@ -190,6 +190,16 @@ export class Picture {
     view.setResolution(Math.min(this.view.getResolution() / 2, this.cell / 4));
   }
 
+  // Where the magnifier would cover what is pointed at, it goes to the other corner.
+  clearLens(place) {
+    const at = this.map.getPixelFromCoordinate(this.local(place)), size = this.map.getSize();
+    if (!at || !size) return;
+    const reach = this.lensBox.offsetWidth + 24;
+    if (at[1] < size[1] - reach) this.lensBox.classList.remove("away");
+    else if (at[0] > size[0] - reach) this.lensBox.classList.add("away");
+    else if (at[0] < reach) this.lensBox.classList.remove("away");
+  }
+
   showLens(shown) {
     this.lensBox.hidden = !shown;
     this.lens.updateSize();

@@ -20,7 +20,7 @@ export function showNext(open, pairs, wanted) {
   }
 }
 
-export function showHand(hand) {
+export function showHand(hand, turned) {
   byId("hand").hidden = !hand;
   byId("hand-none").hidden = Boolean(hand);
   const note = byId("hand-note");
@@ -37,9 +37,12 @@ export function showHand(hand) {
   byId("hand-residual-inliers").textContent = metres(hand.residual_inliers);
   note.textContent = `Add to the moving survey. RANSAC of ${hand.draws.toLocaleString("en")} draws of `
     + `${hand.sample}, within ${hand.radius} m.`;
+  if (turned !== null) {
+    note.textContent += ` The pairs are turned by ${turned.toFixed(2)}° about their middle first, as they themselves ask.`;
+  }
   if (hand.contradictory) {
     note.textContent = `Only ${hand.inliers} of ${hand.pairs} pairs agree within ${hand.radius} m: `
-      + "look at those marked, or the surveys are turned or bent against each other.";
+      + "look at those marked, or the surveys are bent against each other.";
     note.classList.add("bad");
   }
 }

@@ -93,12 +93,14 @@ function follow(leader) {
   quiet = false;
 }
 
+function short(name) { return name.length > 24 ? `${name.slice(0, 23)}…` : name; }
+
 function draw() {
   const open = openPair(), hinted = byId("hint").getAttribute("aria-pressed") === "true";
   for (const picture of Object.values(pictures)) {
     const marks = state.pairs.filter((pair) => pair[picture.side]).map((pair) => ({
       id: pair.id,
-      text: pair.id === chosen && pair.name ? `${pair.id} ${pair.name}` : `${pair.id}`,
+      text: pair.id === chosen && pair.name ? `${pair.id} ${short(pair.name)}` : `${pair.id}`,
       place: pair[picture.side],
       chosen: pair.id === chosen,
       look: pair === open ? "open" : pair.inlier === null ? "plain" : pair.inlier ? "agrees" : "wrong",
@@ -107,7 +109,7 @@ function draw() {
     picture.draw(marks, hinted && partner ? across(other(picture), partner) : null);
   }
   showNext(open, state.pairs, job.wanted);
-  showHand(state.hand);
+  showHand(state.hand, state.turned);
   showCover(state.sectors, state.weak);
   list.show(state.pairs, chosen);
   byId("undo").disabled = !state.can_undo;
@@ -175,9 +177,10 @@ function point(picture, place) {
     byId(`${one.side}-pane`).querySelector(".place").textContent = at ? `E ${at[0].toFixed(3)}  N ${at[1].toFixed(3)}` : "";
   };
   picture.magnify(place);
+  picture.clearLens(place);
   write(picture, place);
   const partner = across(picture, place);
-  if (partner) other(picture).magnify(partner);
+  if (partner) { other(picture).magnify(partner); other(picture).clearLens(partner); }
   write(other(picture), partner);
 }
 
