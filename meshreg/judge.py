@@ -116,12 +116,33 @@ class Judgement:
         return replace(self, verdict=verdict, reason=f"{reason} ({self.reason})")
 
 
+def channel_maps(
+    rasters: Mapping[str, tuple[SurveyRaster, SurveyRaster]], radius: float
+) -> dict[str, ChannelMap]:
+    """Compute the evidence of each channel, "terrain" and "image", that has any.
+
+    Parameters
+    ----------
+    rasters : mapping
+        "dem" and "ortho" to (reference, moving).
+    radius : float
+        Half width of the search window [m].
+    """
+    maps: dict[str, ChannelMap] = {}
+    for channel, raster in (("terrain", "dem"), ("image", "ortho")):
+        found = channel_map(*rasters[raster], channel, radius, SCORED_OVERLAP)  # type: ignore[arg-type]
+        if found is not None:
+            maps[channel] = found
+    return maps
+
+
 def judge(
     estimates: Sequence[OffsetEstimate],
     rasters: Mapping[str, tuple[SurveyRaster, SurveyRaster]],
     settings: Settings,
     radius: float,
     trials: int = 1,
+    maps: Mapping[str, ChannelMap] | None = None,
 ) -> Judgement:
     """Weigh the methods' candidates against the evidence of terrain and image.
 
@@ -136,12 +157,11 @@ def judge(
     trials : int
         How many turns and scales of the moving survey these rasters were chosen from: chance is
         so many times more likely.
+    maps : mapping, optional
+        The `channel_maps` of these rasters, where they have been computed already.
     """
-    maps: dict[str, ChannelMap] = {}
-    for channel, raster in (("terrain", "dem"), ("image", "ortho")):
-        found = channel_map(*rasters[raster], channel, radius, SCORED_OVERLAP)  # type: ignore[arg-type]
-        if found is not None:
-            maps[channel] = found
+    if maps is None:
+        maps = channel_maps(rasters, radius)
     if not maps:
         return Judgement("rejected", "the surveys do not overlap within the search window", None)
     reach = agree_distance(settings.judge, rasters["dem"][0].grid.cell)

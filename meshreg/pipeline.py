@@ -14,6 +14,7 @@ import logging
 import platform
 import time
 from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import Any
 
@@ -292,15 +293,18 @@ def _in_frame(
     motion, first = (None, pairs) if delivered is None else delivered
     scale = 1.0
     estimates: list[OffsetEstimate] = []
-    for method in settings.methods:
-        with clock.stage(method):
-            estimates.append(estimate_offset(*pairs[ESTIMATORS[method].raster], method, settings))
-            log.info("%s: %s %s", method, estimates[-1].status, estimates[-1].reason)
-    if manual is not None:
-        estimates.append(_within(radius, manual(motion)))
-    with clock.stage("judge"):
-        trials = 1 if turn is None or motion is None else turn.trials
-        judgement = judging.judge(estimates, pairs, settings, radius, trials)
+    with ThreadPoolExecutor(1) as beside:  # the evidence does not depend on what the methods say
+        maps = beside.submit(judging.channel_maps, pairs, radius)
+        for method in settings.methods:
+            with clock.stage(method):
+                pair = pairs[ESTIMATORS[method].raster]
+                estimates.append(estimate_offset(*pair, method, settings))
+                log.info("%s: %s %s", method, estimates[-1].status, estimates[-1].reason)
+        if manual is not None:
+            estimates.append(_within(radius, manual(motion)))
+        with clock.stage("judge"):
+            trials = 1 if turn is None or motion is None else turn.trials
+            judgement = judging.judge(estimates, pairs, settings, radius, trials, maps.result())
     refined, heights = None, None
     notes: tuple[str, ...] = ()
     if judgement.best is not None and judgement.verdict != "rejected":

@@ -17,7 +17,7 @@ import numpy as np
 from meshreg.offsets import neutral
 from meshreg.offsets.channels import high_pass
 from meshreg.offsets.correlate import Correlator, Window
-from meshreg.offsets.surface import MAD_TO_SIGMA, find_peak
+from meshreg.offsets.surface import find_peak
 from meshreg.types import Bool, Float64, Grid, SurveyRaster
 
 MAX_YAW = np.deg2rad(1.0)
@@ -168,21 +168,53 @@ def polished_tiles(
         only as far as the guess bends as the models do, since the relief that tells it may lie to
         one side. A tile that runs more than three cells from its start, or shows too little, is
         left out.
+
+    Notes
+    -----
+    Residual ``r = f1(u + b(u) + t) - f2(u)``, Tukey's biweight at four robust deviations, slopes
+    as the mean of both surveys' (so that neither survey's noise shrinks the step).
     """
     overlap = Overlap.at(reference.grid, moving.grid, (float(offset[0]), float(offset[1])))
     side = int(np.clip(overlap.side // 7, 16, TILE_CELLS))
     if overlap.side < 3 * side:
         return None
+    from meshreg.tile_kernels import polish
+
+    tiles = overlap.tiles(side)
+    row, col, bounds = _known_cells(moving.mask, tiles, side)
     bend = _Bend.of(guess, moving.grid, side)
-    half = 0.5 * (side - 1)
-    found = []
-    for top, left in overlap.tiles(side):
-        answer = _polish(reference, moving, (top, left, side), bend)
-        if answer is not None:
-            middle = np.array([top + half, left + half])
-            start = bend.at(middle[:, None])[0]
-            found.append((*moving.grid.east_north(*middle), *(start + answer)))
-    return _as_tiles(found, 0)
+    start = bend.at(np.stack([row, col]))
+    bent = np.stack(moving.grid.east_north(row, col), axis=1) + start
+    added = polish(
+        reference.layers,
+        moving.layers,
+        np.column_stack([row, col, bent]),
+        bounds,
+        np.full(len(tiles), side**2),
+        np.array([reference.grid.west, reference.grid.north]),
+        reference.grid.cell,
+    )
+    found = np.isfinite(added[:, 0])
+    if not found.any():
+        return None
+    middle = np.array(tiles, float)[found].T + 0.5 * (side - 1)
+    places = np.stack(moving.grid.east_north(*middle), axis=1)
+    number = len(places)
+    offsets = bend.at(middle) + added[found]
+    return TileOffsets(places, offsets, np.arange(number), np.zeros(number, int))
+
+
+def _known_cells(
+    mask: Bool, tiles: list[tuple[int, int]], side: int
+) -> tuple[Float64, Float64, np.ndarray]:
+    """Rows and columns of the cells in `mask`, tile after tile, and where each tile's begin."""
+    rows, cols, bounds = [], [], [0]
+    for top, left in tiles:
+        row, col = np.nonzero(mask[top : top + side, left : left + side])
+        rows.append(row + float(top))
+        cols.append(col + float(left))
+        bounds.append(bounds[-1] + len(row))
+    return np.concatenate(rows), np.concatenate(cols), np.array(bounds)
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,14 +245,23 @@ class _Bend:
 
 @dataclass(frozen=True, eq=False)
 class Relief:
-    """High-passed heights, also as a cubic spline, their slopes per metre, where they are known."""
+    """What the fit of a tile reads of a survey (`tile_kernels`).
+
+    Attributes
+    ----------
+    grid : Grid
+    layers : (5, H, W) float64
+        High-passed heights, the same as coefficients of a cubic spline, their slopes along east
+        and north [1/m], and 1 where they are known, three cells from any unknown one.
+    """
 
     grid: Grid
-    field: Float64
-    spline: Float64
-    d_east: Float64
-    d_north: Float64
-    mask: Bool
+    layers: Float64
+
+    @property
+    def mask(self) -> Bool:
+        """(H, W) bool: where the relief is known."""
+        return np.asarray(self.layers[4] > 0)
 
     @classmethod
     def of(cls, raster: SurveyRaster) -> Relief:
@@ -234,54 +275,10 @@ class Relief:
         d_row, d_col = (np.asarray(d, np.float64) for d in np.gradient(field))
         inner = binary_erosion(mask, iterations=3, border_value=0)
         cell = raster.grid.cell
-        spline = spline_filter(field, 3)
-        return cls(raster.grid, field, spline, d_col / cell, -d_row / cell, inner)
-
-
-def _polish(
-    still: Relief, moved: Relief, tile: tuple[int, int, int], bend: _Bend
-) -> Float64 | None:
-    """Find what to add to the bent offset [m] so that a tile fits.
-
-    Residual ``r = f1(u + b(u) + t) - f2(u)``, Tukey's biweight at four robust deviations, slopes
-    as the mean of both surveys' (so that neither survey's noise shrinks the step).
-    """
-    from scipy.ndimage import map_coordinates
-
-    top, left, side = tile
-    row, col = np.nonzero(moved.mask[top : top + side, left : left + side])
-    if len(row) < 0.5 * side**2:
-        return None
-    row, col = row + top, col + left
-    start = bend.at(np.stack([row, col]).astype(float))
-    east, north = moved.grid.east_north(row, col)
-    east, north = east + start[:, 0], north + start[:, 1]
-    offset = np.zeros(2)
-    value = moved.field[row, col]
-    slope = np.stack([moved.d_east[row, col], moved.d_north[row, col]], axis=1)
-    for _ in range(15):
-        place = np.stack(still.grid.row_col(east + offset[0], north + offset[1]))
-        near = np.rint(place).astype(int)
-        rows, cols = still.grid.shape
-        inside = (near[0] >= 0) & (near[0] < rows) & (near[1] >= 0) & (near[1] < cols)
-        inside[inside] = still.mask[near[0, inside], near[1, inside]]
-        if inside.sum() < 0.5 * len(row):
-            return None
-        at = place[:, inside]
-        residual = map_coordinates(still.spline, at, order=3, prefilter=False) - value[inside]
-        other = [map_coordinates(d, at, order=1) for d in (still.d_east, still.d_north)]
-        design = 0.5 * (slope[inside] + np.stack(other, axis=1))
-        spread = MAD_TO_SIGMA * float(np.median(np.abs(residual - np.median(residual))))
-        weight = np.clip(1 - (residual / max(4 * spread, 1e-12)) ** 2, 0, None) ** 2
-        normal = (design * weight[:, None]).T @ design
-        if not np.linalg.cond(normal) < 1e4:  # a single ridge tells only one direction
-            return None
-        step = -np.linalg.solve(normal, (design * weight[:, None]).T @ residual)
-        offset = offset + step
-        if np.abs(step).max() < 1e-7:
-            break
-    still_there = np.hypot(*offset) <= 3 * still.grid.cell
-    return offset if still_there and np.abs(step).max() < 0.01 * still.grid.cell else None
+        return cls(
+            raster.grid,
+            np.stack([field, spline_filter(field, 3), d_col / cell, -d_row / cell, inner]),
+        )
 
 
 def _as_tiles(found: list[tuple[Any, ...]], channel: int) -> TileOffsets | None:

@@ -600,7 +600,8 @@ class OffsetEstimate:
     east, north : float
         Offset [m] to ADD to moving coordinates to lay them on the reference; NaN when failed.
     sigma : (2, 2) float64 or None
-        Covariance of (east, north) [m²].
+        Mean square error of (east, north) [m²], given that it is the right peak
+        (`meshreg.offsets.sandwich`).
     score : float
         The method's own measure at its best offset.
     gap : float

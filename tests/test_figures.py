@@ -281,12 +281,12 @@ def test_two_tone_colours() -> None:
     bright, dark, none = 1.0, 0.0, math.nan
     reference = np.array([[bright, bright, dark, bright, none, none]])
     moving = np.array([[bright, dark, bright, none, bright, none]])
-    white, blue, orange, pale_blue, pale_orange, empty = style.two_tone(reference, moving)[0]
+    white, blue, red, pale_blue, pale_red, empty = style.two_tone(reference, moving)[0]
     assert white.tolist() == [255, 255, 255]
-    assert blue.tolist() == [0, 128, 255]
-    assert orange.tolist() == [255, 128, 0]
+    assert blue.tolist() == [0, 0, 255]
+    assert red.tolist() == [255, 0, 0]
     assert pale_blue[2] > pale_blue[0] > 150
-    assert pale_orange[0] > pale_orange[2] > 150
+    assert pale_red[0] > pale_red[2] > 150
     assert empty.tolist() == [255, 255, 255]
 
 

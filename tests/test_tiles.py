@@ -7,7 +7,9 @@ import dataclasses
 import numpy as np
 import pytest
 import seafloor
+from scipy import ndimage
 
+from meshreg.tile_kernels import polish
 from meshreg.tiles import Overlap, Relief, correlated_tiles, polished_tiles
 from meshreg.types import Grid
 
@@ -94,3 +96,66 @@ def test_tiles_without_ground_are_left_out():
     found = polished(reference, moving)
     assert (found.places[:, 0] > -0.5).all()
     assert len(found.places) >= 12
+
+
+def fitted_slowly(still, moved, place):
+    """What `tile_kernels` does to one tile, in NumPy, SciPy and one loop.
+
+    `place` (N, 4): row and column in the moving survey, and where the cell is bent to [m].
+    """
+    row, col = place[:, :2].T.astype(int)
+    field, _, d_east, d_north, _ = moved.layers
+    value, slope = field[row, col], np.stack([d_east, d_north], axis=-1)[row, col]
+    offset = np.zeros(2)
+    for _ in range(15):
+        at = np.stack(still.grid.row_col(*(place[:, 2:] + offset).T))
+        near = np.rint(at).astype(int)
+        inside = ((near >= 0) & (near < np.array(still.grid.shape)[:, None])).all(axis=0)
+        inside[inside] = still.mask[tuple(near[:, inside])]
+        if inside.sum() < 0.5 * len(place):
+            return np.full(2, np.nan)
+        at = at[:, inside]
+        residual = ndimage.map_coordinates(still.layers[1], at, order=3, prefilter=False)
+        residual -= value[inside]
+        other = [ndimage.map_coordinates(still.layers[k], at, order=1) for k in (2, 3)]
+        design = 0.5 * (slope[inside] + np.stack(other, axis=1))
+        spread = 1.4826 * np.median(np.abs(residual - np.median(residual)))
+        weight = np.clip(1 - (residual / (4 * spread)) ** 2, 0, None) ** 2
+        normal = (design * weight[:, None]).T @ design
+        if np.linalg.cond(normal) >= 1e4:
+            return np.full(2, np.nan)
+        step = -np.linalg.solve(normal, (design * weight[:, None]).T @ residual)
+        offset += step
+        if np.abs(step).max() < 1e-7:
+            break
+    close = np.hypot(*offset) <= 3 * still.grid.cell and np.abs(step).max() < 1e-2 * CELL
+    return offset if close else np.full(2, np.nan)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_the_kernel_does_what_its_twin_does(seed):
+    """On changed ground with holes, from starts that are off, some of them hopelessly."""
+    rng = np.random.default_rng(seed)
+    floor = seafloor.Seafloor.random(seed, size=16.0)
+    still = floor.raster(CELL, 5.0, seed=1)
+    moved = floor.changed(seed + 1, 0.5).moved(-0.02, 0.01).raster(CELL, 4.5, seed=2)
+    still = dataclasses.replace(still, valid=still.valid & (rng.random(still.valid.shape) > 2e-3))
+    one, other = Relief.of(still), Relief.of(moved)
+    parts = []
+    for _ in range(40):
+        top, left = rng.integers(0, 60, 2)
+        row, col = np.nonzero(other.mask[top : top + 16, left : left + 16])
+        row, col = row + top, col + left
+        east, north = moved.grid.east_north(row, col)
+        away = rng.normal(0, rng.choice([0.02, 0.1, 0.5]), 2)
+        parts.append(np.column_stack([row, col, east + away[0], north + away[1]]))
+    bounds = np.cumsum([0, *map(len, parts)])
+    corner = np.array([still.grid.west, still.grid.north])
+    sizes = np.full(len(parts), 256)
+    found = polish(one.layers, other.layers, np.concatenate(parts), bounds, sizes, corner, CELL)
+    expected = np.array([fitted_slowly(one, other, part) for part in parts])
+    full = np.diff(bounds) >= 128
+    assert np.isnan(found[~full]).all()
+    np.testing.assert_array_equal(np.isnan(found[full]), np.isnan(expected[full]))
+    assert np.isfinite(found).any(axis=1).sum() >= 10
+    np.testing.assert_allclose(found[full], expected[full], rtol=0, atol=1e-7)

@@ -21,7 +21,10 @@ def grey(raster: SurveyRaster) -> Float64:
 
 def smooth(field: Float64, mask: Bool, sigma: float) -> Float64:
     """Gaussian mean over the cells in `mask` only (normalised convolution); 0 far from any."""
-    weight = _blurred(mask.astype(np.float64), sigma)
+    return _mean(field, mask, sigma, _blurred(mask.astype(np.float64), sigma))
+
+
+def _mean(field: Float64, mask: Bool, sigma: float, weight: Float64) -> Float64:
     total = _blurred(np.where(mask, field, 0.0), sigma)
     return np.asarray(np.divide(total, weight, out=np.zeros_like(total), where=weight > 1e-6))
 
@@ -49,8 +52,9 @@ def high_pass(field: Float64, mask: Bool, sigma: float) -> Float64:
 
 def local_normalised(field: Float64, mask: Bool, sigma: float) -> Float64:
     """Field minus local mean, over local deviation (`sigma` in cells): light and haze removed."""
-    rest = np.where(mask, field - smooth(field, mask, sigma), 0.0)
-    spread = np.sqrt(smooth(rest**2, mask, sigma))
+    weight = _blurred(mask.astype(np.float64), sigma)
+    rest = np.where(mask, field - _mean(field, mask, sigma, weight), 0.0)
+    spread = np.sqrt(_mean(rest**2, mask, sigma, weight))
     floor = 0.1 * float(np.median(spread[mask])) if mask.any() else 1.0
     return np.where(mask, np.clip(rest / np.maximum(spread, max(floor, 1e-12)), -4, 4), 0.0)
 

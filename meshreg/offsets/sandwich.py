@@ -98,15 +98,15 @@ def sandwich(slopes: Float64, curvature: Float64) -> Float64 | None:
     A 95 % ellipse of two degrees of freedom is drawn at chi-square's 5.99; with B blocks it takes
     Hotelling's ``T² = 2 (B - 1) / (B - 2) F(2, B - 2)``, and the covariance grows by their ratio.
     """
-    from scipy.stats import chi2, f
+    from scipy.special import chdtri, fdtri
 
     count = int((slopes != 0).any(axis=1).sum())
     if count < 4 or not np.linalg.eigvalsh(curvature)[-1] < 0:
         return None
     inverse = np.linalg.inv(curvature)
     covariance = inverse @ (slopes.T @ slopes) @ inverse * (count / (count - 1))
-    hotelling = 2 * (count - 1) / (count - 2) * f.ppf(0.95, 2, count - 2)
-    return np.asarray(covariance * (hotelling / chi2.ppf(0.95, 2)))
+    hotelling = 2 * (count - 1) / (count - 2) * fdtri(2, count - 2, 0.95)
+    return np.asarray(covariance * (hotelling / chdtri(2, 0.05)))
 
 
 def overlap_ground(

@@ -196,7 +196,7 @@ def _consensus(
     cluster show among themselves.
     """
     from scipy.spatial import cKDTree
-    from scipy.stats import binom
+    from scipy.special import bdtrc  # the binomial's tail; all of scipy.stats takes long to import
 
     count, total = int(inliers.sum()), len(offsets)
     centre = offsets[inliers].mean(axis=0)
@@ -207,7 +207,7 @@ def _consensus(
         votes = cKDTree(outside).query_ball_point(outside, inlier_radius, return_length=True)
         second = int(votes.max())
         p0 = max(p0, float(np.mean(votes - 1)) / max(len(outside) - 1, 1))
-    false_alarms = total * float(binom.sf(count - 2, total - 1, min(p0, 1.0)))
+    false_alarms = total * float(bdtrc(count - 2, total - 1, min(p0, 1.0)))
     return Consensus(float(centre[0]), float(centre[1]), inliers, second, false_alarms)
 
 

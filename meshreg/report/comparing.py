@@ -137,7 +137,7 @@ def section(result: Result) -> str:
     )
     still = '<p class="no-js">Without scripts: figures/section.png shows a section.</p>'
     lead = (
-        "Where both surveys agree the relief is grey; blue is the reference alone, orange the "
+        "Where both surveys agree the relief is grey; blue is the reference alone, red the "
         'moving survey alone. <span class="js-only screen-only">Drag the line or its ends.</span>'
     )
     title = "Relief overlaid and cross-section"

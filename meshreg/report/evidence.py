@@ -33,7 +33,7 @@ def draw_matches(registration: Registration) -> Any:
         11.0,
         tall + 1.5,
         f"SIFT: {inliers.sum()} of {inliers.size} matches agree ({share:.1%})",
-        f"green: agree    orange, thin: outliers    at most {MAX_MATCHES} of each drawn",
+        f"green: agree    red, thin: outliers    at most {MAX_MATCHES} of each drawn",
     )
     left, right = figure.add_subplot(1, 2, 1), figure.add_subplot(1, 2, 2)
     pairs = (("reference", left, color), ("moving, as delivered", right, moved))
@@ -43,6 +43,7 @@ def draw_matches(registration: Registration) -> Any:
         axes.set_title(name, fontsize=10)
         place.label(axes, inner=index > 0)
         axes.set_autoscale_on(False)
+    right.tick_params(labelleft=False)  # the matches would cross them
     figure.draw_without_rendering()  # lines from axes to axes need both in their places
     figure.set_layout_engine("none")
     corner = np.array([place.east, place.north])
@@ -50,7 +51,7 @@ def draw_matches(registration: Registration) -> Any:
         np.asarray(matches["reference_points"], float) - corner,
         stated.delivered(matches["moving_points"], registration.evidence.get("motion")) - corner,
     )
-    _lines(figure, (left, right), ends, ~inliers, color=style.MOVING, linewidth=0.3, alpha=0.35)
+    _lines(figure, (left, right), ends, ~inliers, color=style.BAD, linewidth=0.3, alpha=0.35)
     _lines(figure, (left, right), ends, inliers, color=style.GOOD, linewidth=0.7, alpha=0.8)
     return figure
 

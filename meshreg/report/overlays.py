@@ -23,7 +23,7 @@ def draw_relief(registration: Registration) -> Any:
         4.9 * len(stages) + 0.5,
         tall + 1.4,
         "Relief of both surveys, lit from the north-west",
-        "grey: both agree   blue: reference alone   orange: moving alone   pale: seen by one",
+        "grey: both agree   blue: reference alone   red: moving alone   pale: seen by one",
     )
     place = style.Place(grid)
     for index, (name, moving) in enumerate(stages):
@@ -89,7 +89,7 @@ def draw_orthos(registration: Registration) -> Any:
         4.3 * columns + 0.5,
         tall + 1.4,
         "Orthomosaics of both surveys",
-        "overlay: grey where both agree, blue reference alone, orange moving alone",
+        "overlay: grey where both agree, blue reference alone, red moving alone",
     )
     place = style.Place(grid)
     for index, (name, moving) in enumerate(stages):

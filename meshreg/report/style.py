@@ -13,7 +13,7 @@ from meshreg.types import Float64, Grid, SurveyRaster, UInt8
 # Okabe and Ito's palette: told apart with every common colour vision, and in grey.
 REFERENCE = "#0072B2"  # blue
 MOVING = "#D55E00"  # vermilion
-GOOD = "#009E73"  # bluish green
+GOOD, BAD = "#009E73", "#CC1F1F"  # bluish green; red, as thin lines
 SECOND = "#CC79A7"  # reddish purple
 INK = "#222222"
 METHOD_STYLES = {
@@ -137,7 +137,7 @@ def hillshade(height: Float64, cell: float) -> Float64:
 
 
 def two_tone(reference: Float64, moving: Float64) -> UInt8:
-    """Overlay two grey pictures (0-1, NaN = none): blue is reference alone, orange moving alone.
+    """Overlay two grey pictures (0-1, NaN = none): blue is reference alone, red moving alone.
 
     Where both are equally bright the picture is grey; a shift shows as coloured rims.
     """
@@ -145,7 +145,7 @@ def two_tone(reference: Float64, moving: Float64) -> UInt8:
     ref, mov = np.nan_to_num(reference), np.nan_to_num(moving)
     both = alone_r & alone_m
     picture = np.ones((*reference.shape, 3))
-    picture[both] = np.stack([mov, (ref + mov) / 2, ref], axis=-1)[both]
+    picture[both] = np.stack([mov, np.minimum(ref, mov), ref], axis=-1)[both]
     pale = np.array([0.78, 0.88, 0.97]), np.array([0.98, 0.86, 0.78])
     picture[alone_r & ~both] = (pale[0] * (0.6 + 0.4 * ref[..., None]))[alone_r & ~both]
     picture[alone_m & ~both] = (pale[1] * (0.6 + 0.4 * mov[..., None]))[alone_m & ~both]
