@@ -23,6 +23,7 @@ from meshreg.cli_parts.common import (
     require_disk,
 )
 from meshreg.cli_parts.console import Progress, Voice, logging_to
+from meshreg.cli_parts.drawing import draughtsman
 from meshreg.cli_parts.guard import Unfinished
 from meshreg.cli_parts.reporting import add_report
 from meshreg.cli_parts.validating import read_manual
@@ -61,7 +62,6 @@ def register_into(folder: Path, request: RegisterRequest, progress: Progress) ->
     from meshreg.io.frames import common_crs
     from meshreg.io.record import with_frames, write_record_files
     from meshreg.pipeline import register_pair
-    from meshreg.report import draw_figures
 
     _log_start(request)
     threading.Thread(target=_import_early, daemon=True).start()
@@ -89,43 +89,44 @@ def register_into(folder: Path, request: RegisterRequest, progress: Progress) ->
     require_disk(folder, moving)
     pairing.require_memory((reference, moving), request.settings)
     reading = time.perf_counter() - clock
-    registration = register_pair(
-        reference,
-        moving,
-        request.settings,
-        reference_mask=masks["reference"],
-        moving_mask=masks["moving"],
-        manual=manual,
-        progress=progress,
-    )
-    for survey in (reference, moving):
-        unchanged(survey)
-    later = pairing.masked_notes(registration)
-    if registration.verdict != "accepted":
-        later += pairing.unit_notes((reference, moving))
-    for note in later:
-        LOG.warning("%s", note)
-    notes += later
-    registration = dataclasses.replace(
-        with_frames(registration, reference, moving),
-        notes=(*registration.notes, *notes),
-        seconds={"read": reading, **registration.seconds},
-    )
-    _log_result(registration)
-    progress("write", 0.0)
-    with ThreadPoolExecutor(1) as beside:  # a failure of either ends the job, and the folder
-        figures = beside.submit(draw_figures, registration, folder / "figures")
-        write_record_files(registration, folder, reference=reference, moving=moving)
-        add_report(registration, folder)
-        progress("figures", 0.0)
-        figures.result()
+    with draughtsman(reference, moving) as draw:
+        registration = register_pair(
+            reference,
+            moving,
+            request.settings,
+            reference_mask=masks["reference"],
+            moving_mask=masks["moving"],
+            manual=manual,
+            progress=progress,
+        )
+        for survey in (reference, moving):
+            unchanged(survey)
+        later = pairing.masked_notes(registration)
+        if registration.verdict != "accepted":
+            later += pairing.unit_notes((reference, moving))
+        for note in later:
+            LOG.warning("%s", note)
+        notes += later
+        registration = dataclasses.replace(
+            with_frames(registration, reference, moving),
+            notes=(*registration.notes, *notes),
+            seconds={"read": reading, **registration.seconds},
+        )
+        _log_result(registration)
+        progress("write", 0.0)
+        with ThreadPoolExecutor(1) as beside:  # a failure of either ends the job, and the folder
+            figures = beside.submit(draw, registration, folder / "figures")
+            write_record_files(registration, folder, reference=reference, moving=moving)
+            add_report(registration, folder)
+            progress("figures", 0.0)
+            figures.result()
     progress("figures", 1.0)
     return registration
 
 
 def _import_early() -> None:
     """Import what the later stages will need: reading leaves half of the machine idle."""
-    for name in ("cv2", "scipy.fft", "scipy.ndimage", "scipy.spatial", "matplotlib.figure"):
+    for name in ("cv2", "scipy.fft", "scipy.ndimage", "scipy.spatial"):
         with suppress(ImportError):  # the stage that needs it says so
             importlib.import_module(name)
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -52,8 +53,9 @@ def match(
     """Find features in both mosaics, match them and find the consensus within `radius` metres."""
     options = settings.sift
     robust = options.exhaustive_vote
-    points1, descriptors1 = features(reference, options, robust)
-    points2, descriptors2 = features(moving, options, robust)
+    with ThreadPoolExecutor(2) as both:
+        found = both.map(lambda raster: features(raster, options, robust), (reference, moving))
+        (points1, descriptors1), (points2, descriptors2) = found
     pairs = nearest(descriptors2, descriptors1, options.ratio, settings.seed)
     a, b = points1[pairs[:, 1]], points2[pairs[:, 0]]
     offsets = a - b

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Generator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import closing
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -76,22 +79,35 @@ def load_pages(mesh: Mesh, group: list[PagePlan]) -> tuple[Pages, list[int]]:
     sizes = [plan.stored[0] * plan.stored[1] for plan in group]
     texels = np.empty(sum(sizes), np.uint32)
     missing, offset = [], 0
-    for plan, size in zip(group, sizes, strict=True):
-        try:
-            image = _decoded(plan.texture)
-        except InputError as error:
-            log.warning("Texture page %s is left out: %s", plan.texture.name, error)
-            missing.append(plan.index)
-            continue
-        if plan.times == 1:
-            packed(image, texels[offset : offset + size])
-        else:
-            shrunk(image, _used(mesh, plan), plan.times, texels[offset : offset + size])
-        width, height = plan.texture.size
-        scale = width / plan.times, height / plan.times
-        table[plan.index] = (offset, *plan.stored, plan.wraps, *scale)
-        offset += size
+    with closing(_decoding(group)) as pages:
+        for plan, size, decoded in zip(group, sizes, pages, strict=True):
+            try:
+                image = decoded.result()
+            except InputError as error:
+                log.warning("Texture page %s is left out: %s", plan.texture.name, error)
+                missing.append(plan.index)
+                continue
+            if plan.times == 1:
+                packed(image, texels[offset : offset + size])
+            else:
+                shrunk(image, _used(mesh, plan), plan.times, texels[offset : offset + size])
+            width, height = plan.texture.size
+            scale = width / plan.times, height / plan.times
+            table[plan.index] = (offset, *plan.stored, plan.wraps, *scale)
+            offset += size
     return Pages(table, texels), missing
+
+
+def _decoding(group: list[PagePlan]) -> Generator[Future[UInt8], None, None]:
+    """Decode each page while the one before it is packed; no more than two are in memory."""
+    with ThreadPoolExecutor(1) as beside:
+        ahead: Future[UInt8] | None = None
+        for plan in group:
+            current, ahead = ahead, beside.submit(_decoded, plan.texture)
+            if current is not None:
+                yield current
+        if ahead is not None:
+            yield ahead
 
 
 def _decoded(texture: Texture) -> UInt8:
