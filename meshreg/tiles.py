@@ -9,12 +9,13 @@ horizontal warp of the models from bending a single global fit toward where they
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from meshreg.offsets import neutral
+from meshreg.offsets import correlate, neutral
 from meshreg.offsets.channels import high_pass
 from meshreg.offsets.correlate import Correlator, Window
 from meshreg.offsets.surface import find_peak
@@ -105,9 +106,15 @@ def correlated_tiles(
     side = int(np.clip(overlap.side // 5, 16, 128))
     span = overlap.rows[1] - overlap.rows[0], overlap.cols[1] - overlap.cols[0]
     reach = int(np.ceil(0.5 * np.hypot(*span) * MAX_YAW)) + 3
+    tiles = overlap.tiles(side)
+
+    def matched(tile: tuple[int, int]) -> tuple[float, float] | None:
+        return _correlate_tile(first, second, (*tile, side), overlap, reach, moving.grid.cell)
+
+    with ThreadPoolExecutor(correlate.WORKERS) as several:
+        steps = list(several.map(matched, tiles))
     found = []
-    for top, left in overlap.tiles(side):
-        step = _correlate_tile(first, second, (top, left, side), overlap, reach, moving.grid.cell)
+    for (top, left), step in zip(tiles, steps, strict=True):
         if step is not None:
             middle = moving.grid.east_north(top + 0.5 * (side - 1), left + 0.5 * (side - 1))
             found.append((*middle, overlap.offset[0] + step[0], overlap.offset[1] + step[1]))
@@ -143,7 +150,7 @@ def _correlate_tile(
         np.asarray(-steps * cell, np.float64),
         (a.mask.shape, b.mask.shape),
     )
-    correlator = Correlator(window)
+    correlator = Correlator(window, workers=1)
     surface, _ = neutral.surface(
         neutral.spectra(a, correlator), neutral.spectra(b, correlator), correlator, 0.5
     )

@@ -106,18 +106,20 @@ class Correlator:
     """Masked sums over the window's offsets; each array is transformed once and reused.
 
     `single` computes in float32, twice as fast: for fields of zero mean and unit size, where six
-    digits are plenty, not for heights or exact counts.
+    digits are plenty, not for heights or exact counts. `workers` are the threads of a transform:
+    for a small window more than one cost more than they bring.
     """
 
     window: Window
     single: bool = False
+    workers: int | None = None
 
     def transform(self, array: Any) -> Complex:
         """Forward transform of one raster, zero outside its mask."""
         from scipy.fft import rfft2
 
         array = np.asarray(array, np.float32 if self.single else np.float64)
-        return np.asarray(rfft2(array, s=self.window.padded, workers=WORKERS))
+        return np.asarray(rfft2(array, s=self.window.padded, workers=self.workers or WORKERS))
 
     def sums(self, *pairs: tuple[Complex, Complex]) -> Float64:
         """``sum over pairs of sum_r a[r + s] b[r]`` for each offset, (K, L) float64."""
@@ -135,9 +137,9 @@ class Correlator:
         from scipy.fft import ifft, irfft
 
         size = self.window.padded
-        half = ifft(product, axis=-2, workers=WORKERS, overwrite_x=True)
+        half = ifft(product, axis=-2, workers=self.workers or WORKERS, overwrite_x=True)
         asked = half[..., self.window.rows % size[0], :]
-        return irfft(asked, n=size[1], axis=-1, workers=WORKERS, overwrite_x=True)
+        return irfft(asked, n=size[1], axis=-1, workers=self.workers or WORKERS, overwrite_x=True)
 
     def counts(self, a: Complex, b: Complex) -> Float64:
         """Like `sums`, of two masks: whole numbers."""
