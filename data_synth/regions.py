@@ -70,6 +70,8 @@ def outline(event: Event, corners: int = 24) -> Float64:
     angle = 2.0 * math.pi * np.arange(corners) / corners
     ring = np.stack([np.cos(angle), np.sin(angle)], axis=1) / math.cos(math.pi / corners)
     points = np.concatenate([np.array(c[:2]) + c[2] * ring for c in event.circles])
+    if len(event.circles) == 1:
+        return points
     hull: Float64 = points[ConvexHull(points).vertices]
     return hull
 
@@ -108,7 +110,7 @@ def _sand(scene: Scene) -> list[list[list[float]]]:
 
     from data_synth.seafloor_kernels import evaluate_ground
 
-    step = max(0.02, scene.size / 1000.0)
+    step = max(0.03, scene.size / 500.0)
     west, south, east, north = (
         edge + way * 5 * step
         for edge, way in zip(scene.reference.footprint, (-1, -1, 1, 1), strict=True)
