@@ -127,8 +127,10 @@ def design(places: Float64, pivot: Float64, terms: int) -> Float64:
 
 def correlation(first: Float64, second: Float64, reach: float) -> Float64:
     """(M, N) Matérn correlation of smoothness 5/2 between places."""
-    away = np.sqrt(((first[:, None] - second[None]) ** 2).sum(axis=2)) * (np.sqrt(5) / reach)
-    return np.asarray((1 + away + away**2 / 3) * np.exp(-away))
+    from scipy.spatial.distance import cdist
+
+    away = cdist(first, second) * (np.sqrt(5) / reach)
+    return np.asarray((1 + away + away * away / 3) * np.exp(-away))
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib
 import sys
-import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,6 +14,7 @@ from meshreg.cli_parts import pairing
 from meshreg.cli_parts.common import (
     LOG,
     SurveyRequest,
+    import_early,
     new_folder,
     read,
     read_masks,
@@ -64,7 +62,7 @@ def register_into(folder: Path, request: RegisterRequest, progress: Progress) ->
     from meshreg.pipeline import register_pair
 
     _log_start(request)
-    threading.Thread(target=_import_early, daemon=True).start()
+    import_early("cv2", "scipy.fft", "scipy.ndimage", "scipy.spatial")
     clock = time.perf_counter()
     progress("read", 0.0)
     reference = read(request.reference, "reference")
@@ -122,13 +120,6 @@ def register_into(folder: Path, request: RegisterRequest, progress: Progress) ->
             figures.result()
     progress("figures", 1.0)
     return registration
-
-
-def _import_early() -> None:
-    """Import what the later stages will need: reading leaves half of the machine idle."""
-    for name in ("cv2", "scipy.fft", "scipy.ndimage", "scipy.spatial"):
-        with suppress(ImportError):  # the stage that needs it says so
-            importlib.import_module(name)
 
 
 def _log_start(request: RegisterRequest) -> None:
