@@ -229,7 +229,7 @@ def channel_map(
         window = Window.around(reference.grid, neutral.turned_grid(moving.grid, turn), radius)
         if window.empty:
             return None
-        correlator = Correlator(window, single=True)
+        correlator = Correlator(window, single=True, workers=1)  # SIFT runs beside it
         if window.padded not in transformed:
             transformed[window.padded] = neutral.spectra(first, correlator)
         changed = neutral.spectra(other, correlator)

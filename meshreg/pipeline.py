@@ -507,14 +507,18 @@ def _lay_down(
     masks: Mapping[str, Any],
     pairs: Pairs,
 ) -> dict[str, Any]:
-    """Rasterize both surveys on common grids, which hold the moving one before and after."""
+    """Lay both surveys on common grids, which hold the moving one before and after.
+
+    What SIFT looks at is not needed any more: cells are as large as the orthomosaic's.
+    """
     rasters: dict[str, Any] = {}
-    grids = {name: common_grid(a.grid, b.grid) for name, (a, b) in pairs.items()}
+    kept = {name: pairs[name] for name in ("dem", "ortho")}
+    grids = {name: common_grid(a.grid, b.grid) for name, (a, b) in kept.items()}
     if transform is not None:
         cells = _cells(settings)
         there = survey_grids(moving, cells, _lattice(cells), transform=transform)
         grids = {name: common_grid(grid, there[name]) for name, grid in grids.items()}
-    for name in ("dem", "ortho"):
+    for name in kept:
         rasters[f"reference_{name}"] = statistics.on_grid(pairs[name][0], grids[name])
         rasters[f"moving_{name}_before"] = statistics.on_grid(pairs[name][1], grids[name])
     if transform is None:

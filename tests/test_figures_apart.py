@@ -15,9 +15,8 @@ from PIL import Image
 
 from meshreg.cli_parts import drawing
 from meshreg.report import draw_figures
-from meshreg.types import PointCloud, Survey
 
-SMALL = Survey("small", PointCloud(np.zeros((3, 3))))
+SMALL = str(Path(__file__).parent.parent / "meshreg" / "demo_data" / "beach_2018.obj")
 
 
 @pytest.fixture

@@ -1,12 +1,13 @@
 """The figures of a large pair are drawn by a second process.
 
 Matplotlib holds the interpreter for seconds, in which nothing else of ours could go on. The process
-is started while the surveys are registered, so that its imports cost no time. A small pair is not
-worth one: there a thread does.
+is started before the surveys are read, so that what it has to load, Matplotlib and VTK, is there
+when they are registered. A small pair is not worth one: there a thread draws.
 """
 
 from __future__ import annotations
 
+import gc
 import logging
 import logging.handlers
 import multiprocessing
@@ -21,13 +22,13 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from meshreg.cli_parts.common import LOG
-from meshreg.types import Maps
+from meshreg.errors import MeshregError
 
 if TYPE_CHECKING:
-    from meshreg.types import Registration, Survey
+    from meshreg.types import Registration
 
 Draw = Callable[["Registration", Path], object]
-LARGE = 500_000  # points or cells of both surveys together
+LARGE = 30e6  # bytes of both surveys' files together
 
 
 def _frozen(values: dict[Any, Any]) -> MappingProxyType[Any, Any]:
@@ -39,11 +40,11 @@ ForkingPickler.register(MappingProxyType, lambda frozen: (_frozen, (dict(frozen)
 
 
 @contextmanager
-def draughtsman(*surveys: Survey) -> Iterator[Draw]:
-    """Give what draws the figures of a registration of these surveys into a folder."""
-    from meshreg.report import draw_figures
+def draughtsman(*surveys: str) -> Iterator[Draw]:
+    """Give what draws the figures of a registration of these surveys' files into a folder."""
+    if sum(_size(path) for path in surveys) < LARGE:
+        from meshreg.report import draw_figures
 
-    if sum(_size(survey) for survey in surveys) < LARGE:
         yield draw_figures
         return
     context = multiprocessing.get_context("spawn")
@@ -59,9 +60,15 @@ def draughtsman(*surveys: Survey) -> Iterator[Draw]:
         process.join(5.0)
 
 
-def _size(survey: Survey) -> int:
-    geometry = survey.geometry
-    return geometry.height.size if isinstance(geometry, Maps) else len(geometry.points)
+def _size(path: str) -> int:
+    """Bytes of a survey's files; what is wrong with them is for the one who reads them to say."""
+    from meshreg.io.blocks import find_blocks
+
+    with suppress(MeshregError, OSError):
+        files = [block.path for block in find_blocks(path)]
+        inside = [f for path in files for f in (path.iterdir() if path.is_dir() else [path])]
+        return sum(file.stat().st_size for file in inside)
+    return 0
 
 
 def _drawn_there(pipe: Connection, registration: Registration, folder: Path) -> None:
@@ -84,16 +91,19 @@ def _drawn_there(pipe: Connection, registration: Registration, folder: Path) -> 
 def _serve(pipe: Connection) -> None:
     """Wait for one registration, draw it, and send back what was logged, or the error."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's business
-    import matplotlib.backends.backend_agg  # noqa: F401 - now, while there is time
-
-    from meshreg.report import draw_figures
+    gc.disable()  # it lives for one registration
+    from meshreg.report import draw_figures, scene, style
 
     said: queue.SimpleQueue[logging.LogRecord] = queue.SimpleQueue()
     LOG.addHandler(logging.handlers.QueueHandler(said))
     LOG.setLevel(logging.INFO)
-    with suppress(EOFError, OSError):
+    with suppress(EOFError, OSError), scene.renderer() as ready:
+        first = style.new_figure(2, 2, "loads fonts and much else")
+        first.add_subplot().plot([0, 1], label="now, while there is time")
+        first.canvas.draw()
         try:
-            draw_figures(*pipe.recv())
+            registration, folder = pipe.recv()
+            draw_figures(registration, folder, renderer=ready)
         except EOFError:
             raise
         except Exception as error:

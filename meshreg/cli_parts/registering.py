@@ -28,7 +28,7 @@ from meshreg.cli_parts.validating import read_manual
 from meshreg.settings import Settings
 
 if TYPE_CHECKING:
-    from meshreg.types import Registration
+    from meshreg.types import Registration, Survey
 
 
 @dataclass(frozen=True)
@@ -56,38 +56,31 @@ def register(request: RegisterRequest, voice: Voice, unfinished: Unfinished) -> 
 
 def register_into(folder: Path, request: RegisterRequest, progress: Progress) -> Registration:
     """Read, register, write everything into a folder that is there already."""
-    from meshreg.io import require_warpable, same_files, unchanged
+    from meshreg.io import unchanged
     from meshreg.io.frames import common_crs
-    from meshreg.io.record import with_frames, write_record_files
-    from meshreg.pipeline import register_pair
 
     _log_start(request)
-    import_early("cv2", "scipy.fft", "scipy.ndimage", "scipy.spatial")
-    clock = time.perf_counter()
-    progress("read", 0.0)
-    reference = read(request.reference, "reference")
-    progress("read", 0.5)
-    moving = read(request.moving, "moving")
-    if request.settings.warp.model != "none":
-        require_warpable(moving)
-    requests = (request.reference, request.moving)
-    pairing.require_scale(requests, (reference, moving))
-    radius = request.settings.search.radius or 10.0
-    moving, notes = pairing.same_frame(requests, (reference, moving), radius)
-    notes += pairing.level_notes((reference, moving))
-    if same := same_files(reference, moving):
-        notes.append(same)
-    masks = read_masks(request.masks, {"reference": reference, "moving": moving})
-    moving, crs_notes = common_crs(reference, moving)
-    notes += crs_notes
-    for note in notes:
-        LOG.warning("%s", note)
-    manual, picked = read_manual(request.ties, reference, request.settings)
-    notes += picked
-    require_disk(folder, moving)
-    pairing.require_memory((reference, moving), request.settings)
-    reading = time.perf_counter() - clock
-    with draughtsman(reference, moving) as draw:
+    with draughtsman(request.reference.path, request.moving.path) as draw:
+        # not before: cv2 changes sys.path while it is imported, and the new process gets a copy
+        import_early(
+            "cv2", "scipy.fft", "scipy.ndimage", "scipy.spatial", "meshreg.pipeline",
+            "meshreg.report", "meshreg.io.record", "rasterio", "tomli_w",
+        )  # fmt: skip
+        clock = time.perf_counter()
+        reference, moving, notes = _read_both(request, progress)
+        masks = read_masks(request.masks, {"reference": reference, "moving": moving})
+        moving, crs_notes = common_crs(reference, moving)
+        notes += crs_notes
+        for note in notes:
+            LOG.warning("%s", note)
+        manual, picked = read_manual(request.ties, reference, request.settings)
+        notes += picked
+        require_disk(folder, moving)
+        pairing.require_memory((reference, moving), request.settings)
+        reading = time.perf_counter() - clock
+        from meshreg.io.record import with_frames, write_record_files
+        from meshreg.pipeline import register_pair
+
         registration = register_pair(
             reference,
             moving,
@@ -120,6 +113,26 @@ def register_into(folder: Path, request: RegisterRequest, progress: Progress) ->
             figures.result()
     progress("figures", 1.0)
     return registration
+
+
+def _read_both(request: RegisterRequest, progress: Progress) -> tuple[Survey, Survey, list[str]]:
+    """Read both surveys, the moving one in the reference's frame; and what to say of them."""
+    from meshreg.io import require_warpable, same_files
+
+    progress("read", 0.0)
+    reference = read(request.reference, "reference")
+    progress("read", 0.5)
+    moving = read(request.moving, "moving")
+    if request.settings.warp.model != "none":
+        require_warpable(moving)
+    requests = (request.reference, request.moving)
+    pairing.require_scale(requests, (reference, moving))
+    radius = request.settings.search.radius or 10.0
+    moving, notes = pairing.same_frame(requests, (reference, moving), radius)
+    notes += pairing.level_notes((reference, moving))
+    if same := same_files(reference, moving):
+        notes.append(same)
+    return reference, moving, notes
 
 
 def _log_start(request: RegisterRequest) -> None:

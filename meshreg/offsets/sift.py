@@ -119,7 +119,7 @@ def features(raster: SurveyRaster, options: SiftSettings, equalise: bool) -> tup
 
 def _eight_bit(image: Float64, mask: Bool, equalise: bool) -> UInt8:
     if equalise:
-        image = 127.5 + 40 * local_normalised(image, mask, 16.0)
+        image = 127.5 + 40 * local_normalised(image.astype(np.float32), mask, 16.0)
     fill = float(np.median(image[mask]))
     return np.clip(np.rint(np.where(mask, image, fill)), 0, 255).astype(np.uint8)
 
@@ -134,14 +134,16 @@ def nearest(query: Any, train: Any, ratio: float, seed: int) -> Any:
     if len(query) < 2 or len(train) < 2:
         return np.zeros((0, 2), np.int64)
     cv2.setRNGSeed(seed)
-    matcher = cv2.FlannBasedMatcher({"algorithm": 1, "trees": 4}, {"checks": 64})
-    found = matcher.knnMatch(query, train, k=2)
-    kept = [
-        (pair[0].queryIdx, pair[0].trainIdx)
-        for pair in found
-        if len(pair) == 2 and (ratio >= 1 or pair[0].distance < ratio * pair[1].distance)
-    ]
-    return np.array(kept, np.int64).reshape(-1, 2)
+    index = cv2.flann.Index(train, {"algorithm": 1, "trees": 4})
+
+    def found(part: Any) -> Any:
+        return index.knnSearch(part, 2, params={"checks": 64})
+
+    with ThreadPoolExecutor(2) as both:
+        halves = list(both.map(found, np.array_split(query, 2)))
+    neighbour, squared = (np.concatenate(parts) for parts in zip(*halves, strict=True))
+    kept = np.flatnonzero((squared[:, 0] < ratio**2 * squared[:, 1]) | (ratio >= 1))
+    return np.stack([kept, neighbour[kept, 0]], axis=1).astype(np.int64)
 
 
 def draws(options: SiftSettings) -> int:

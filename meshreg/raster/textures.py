@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections import deque
 from collections.abc import Generator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger("meshreg")
 _GROUP_BYTES = 1 << 30  # decoded pages that are in memory together
+_SMALL_PAGE = 1 << 25  # texels
 
 
 @dataclass(frozen=True)
@@ -99,15 +101,17 @@ def load_pages(mesh: Mesh, group: list[PagePlan]) -> tuple[Pages, list[int]]:
 
 
 def _decoding(group: list[PagePlan]) -> Generator[Future[UInt8], None, None]:
-    """Decode each page while the one before it is packed; no more than two are in memory."""
-    with ThreadPoolExecutor(1) as beside:
-        ahead: Future[UInt8] | None = None
+    """Decode pages while those before them are packed: two at once, large ones one by one."""
+    largest = max((plan.texture.size[0] * plan.texture.size[1] for plan in group), default=0)
+    several = 2 if largest <= _SMALL_PAGE else 1
+    ahead: deque[Future[UInt8]] = deque()
+    with ThreadPoolExecutor(several) as beside:
         for plan in group:
-            current, ahead = ahead, beside.submit(_decoded, plan.texture)
-            if current is not None:
-                yield current
-        if ahead is not None:
-            yield ahead
+            ahead.append(beside.submit(_decoded, plan.texture))
+            if len(ahead) > several:
+                yield ahead.popleft()
+        while ahead:
+            yield ahead.popleft()
 
 
 def _decoded(texture: Texture) -> UInt8:

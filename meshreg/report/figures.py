@@ -31,7 +31,11 @@ FIGURES: dict[str, Callable[[Registration], Any]] = {
 
 
 def draw_figures(
-    registration: Registration, folder: str | Path, *, scene_seconds: float = 120.0
+    registration: Registration,
+    folder: str | Path,
+    *,
+    scene_seconds: float = 120.0,
+    renderer: scene.Renderer | None = None,
 ) -> tuple[Path, ...]:
     """Draw every figure that the registration has evidence for, as PNG files.
 
@@ -43,6 +47,8 @@ def draw_figures(
         Made if absent.
     scene_seconds : float
         Time allowed for the 3-D still, which is rendered in a child process; 0 leaves it out.
+    renderer : scene.Renderer, optional
+        That child process, where one has been started already (`scene.renderer`).
 
     Returns
     -------
@@ -60,7 +66,9 @@ def draw_figures(
     if scene_seconds <= 0:
         return tuple(_drawn(jobs, folder))
     with ThreadPoolExecutor(1) as beside:  # its child works while the others are drawn here
-        still = beside.submit(scene.draw_scene, registration, folder / "scene.png", scene_seconds)
+        still = beside.submit(
+            scene.draw_scene, registration, folder / "scene.png", scene_seconds, renderer
+        )
         written = _drawn(jobs, folder)
     return tuple(written + [path for path in (still.result(),) if path])
 

@@ -36,7 +36,7 @@ def draw_residuals(registration: Registration) -> Any:
         12.0 if heights else 7.6,
         style.panel_size(grid, 4.6 if heights else 6.0) + 1.7,
         "What is left after the rigid move, tile by tile",
-        "",
+        bars=True,
     )
     axes = np.atleast_1d(figure.subplots(1, 2 if heights else 1))
     place = style.Place(grid)
@@ -130,6 +130,7 @@ def draw_height_difference(registration: Registration) -> Any:
         style.panel_size(grid, 5.6, 6.5) + 1.2,
         "Height of the registered survey above the reference",
         "blue: lower than the reference    red: higher",
+        bars=True,
     )
     axes, side = figure.subplots(1, 2, width_ratios=(1.35, 1))
     look: dict[str, Any] = {"cmap": "RdBu_r", "vmin": -limit, "vmax": limit}

@@ -5,25 +5,30 @@ VTK kills the process that runs it where OpenGL is missing, so it never runs in 
 
 from __future__ import annotations
 
+import json
 import logging
 import os
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
 from meshreg.report import style
 from meshreg.types import Registration
 
+Renderer: TypeAlias = "subprocess.Popen[str]"
 _LOG = logging.getLogger("meshreg")
 _SIDE = 350  # grid points along the longer side
 
 # VTK itself: pyvista, which wraps it, takes a second to import.
+# The window is opened before there is anything to show, which takes as long as the rest.
 _CHILD = """
-import sys
+import json, sys
 import numpy as np
 import vtkmodules.vtkRenderingOpenGL2
 from vtkmodules.util.numpy_support import numpy_to_vtk, vtk_to_numpy
@@ -33,13 +38,17 @@ from vtkmodules.vtkRenderingCore import (
     vtkActor, vtkCamera, vtkLightKit, vtkPolyDataMapper, vtkRenderer, vtkRenderWindow,
     vtkWindowToImageFilter,
 )
-folder, target = sys.argv[1:]
-data = dict(np.load(folder + "/scene.npz"))
-east, north = np.meshgrid(data["east"], data["north"])
 window = vtkRenderWindow()
 window.SetOffScreenRendering(True)
-window.SetSize(2400, 1200)
+window.SetSize(2000, 1000)
 window.SetMultiSamples(0)
+window.Render()
+asked = sys.stdin.readline()
+if not asked:
+    sys.exit()
+source, target = json.loads(asked)
+data = dict(np.load(source))
+east, north = np.meshgrid(data["east"], data["north"])
 lights, camera, ends = vtkLightKit(), vtkCamera(), []
 camera.SetPosition(-0.45, -1.0, 0.9)
 camera.SetViewUp(0, 0, 1)
@@ -84,34 +93,51 @@ np.save(target, vtk_to_numpy(picture.GetPointData().GetScalars()).reshape(tall, 
 """
 
 
-def draw_scene(registration: Registration, path: Path, seconds: float) -> Path | None:
-    """Render both surveys side by side to `path`; None, with a line in the log, if it cannot be."""
+@contextmanager
+def renderer() -> Iterator[Renderer]:
+    """Start the process that renders; it loads VTK while the caller goes on.
+
+    Raises
+    ------
+    OSError
+        If no process can be started.
+    """
+    pipe = subprocess.PIPE
+    environment = {**os.environ, "PYTHONWARNINGS": "ignore"}
+    command = [sys.executable, "-c", _CHILD]
+    with subprocess.Popen(
+        command, stdin=pipe, stdout=pipe, stderr=pipe, env=environment, text=True, errors="replace"
+    ) as child:
+        try:
+            yield child
+        finally:
+            child.kill()
+
+
+def draw_scene(
+    registration: Registration, path: Path, seconds: float, ready: Renderer | None = None
+) -> Path | None:
+    """Render both surveys side by side to `path`; None, with a line in the log, if it cannot be.
+
+    `ready` is a `renderer` that waits for its one picture; without it one is started.
+    """
     arrays = _arrays(registration)
     if arrays is None:
         return None
-    environment = {**os.environ, "PYTHONWARNINGS": "ignore"}
     with tempfile.TemporaryDirectory(prefix="meshreg-") as folder:
-        np.savez(Path(folder, "scene.npz"), **arrays)
-        picture = Path(folder, "scene.npy")
-        command = [sys.executable, "-c", _CHILD, folder, str(picture)]
+        source, picture = Path(folder, "scene.npz"), Path(folder, "scene.npy")
+        np.savez(source, **arrays)
+        asked = json.dumps([str(source), str(picture)]) + "\n"
         try:
-            done = subprocess.run(
-                command,
-                capture_output=True,
-                text=True,
-                errors="replace",
-                timeout=seconds,
-                env=environment,
-                stdin=subprocess.DEVNULL,
-                check=False,
-            )
+            with nullcontext(ready) if ready is not None else renderer() as child:
+                _, said = child.communicate(asked, timeout=seconds)
         except (OSError, subprocess.TimeoutExpired) as error:
             _LOG.info("No 3-D still: %s", error)
             return None
-        if done.returncode != 0 or not picture.exists():
+        if child.returncode != 0 or not picture.exists():
             _LOG.info(
                 "No 3-D still: this machine cannot render it (%s); see `meshreg doctor`.",
-                _death(done.returncode, done.stderr),
+                _death(child.returncode, said),
             )
             return None
         _save(np.load(picture), path, float(arrays["exaggeration"]))

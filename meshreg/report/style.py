@@ -38,13 +38,20 @@ def method_name(method: str) -> str:
     return METHOD_NAMES.get(method, method.replace("_", " "))
 
 
-def new_figure(width: float, height: float, title: str, subtitle: str = "") -> Any:
-    """Return a figure of `width` × `height` inches that needs no screen, with its title."""
+def new_figure(
+    width: float, height: float, title: str, subtitle: str = "", *, bars: bool = False
+) -> Any:
+    """Return a figure of `width` × `height` inches that needs no screen, with its title.
+
+    `bars`: it has colour bars between its panels; only the slower layout keeps them apart.
+    """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     scale = min(1.0, MAX_PIXELS / DPI / max(width, height))
-    figure = Figure(figsize=(width * scale, height * scale), dpi=DPI, layout="constrained")
+    figure = Figure(
+        figsize=(width * scale, height * scale), dpi=DPI, layout="constrained" if bars else "tight"
+    )
     FigureCanvasAgg(figure)
     figure.suptitle(title, fontsize=12, fontweight="bold", color=INK)
     if subtitle:

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from meshreg.errors import InputError, OutputError, UsageError
-from meshreg.io import line_blocks, obj_write
+from meshreg.io import line_blocks, obj_write, obj_write_kernels
 from meshreg.io.images import open_texture, texture_from_array
 from meshreg.io.mover import make_mover
 from meshreg.io.obj import read, rewrite, write
@@ -428,27 +428,47 @@ def test_a_file_is_not_moved_onto_itself(tmp_path):
         rewrite(source, mover, path)
 
 
-def test_what_does_not_read_back_is_not_kept(tmp_path, monkeypatch):
-    path, source, mover = triangle(tmp_path)
-    real = obj_write.scan
-    monkeypatch.setattr(obj_write, "scan", lambda _: real(path))
-    with pytest.raises(OutputError, match="does not read back"):
+def spoiled(monkeypatch, change):
+    """Let the writing kernel spoil the bytes that it has written."""
+    real = obj_write_kernels.put_vectors
+
+    def put(data, end, spans, values, decimals, out):
+        size = real(data, end, spans, values, decimals, out)
+        text = change(out[:size].tobytes())
+        out[: len(text)] = np.frombuffer(text, np.uint8)
+        return len(text)
+
+    monkeypatch.setattr(obj_write_kernels, "put_vectors", put)
+
+
+def test_one_wrong_number_is_not_kept(tmp_path, monkeypatch):
+    """Within the bounds of the others too: each point is compared."""
+    path, moved = tmp_path / "reef.obj", tmp_path / "moved.obj"
+    write(Survey("reef", grid_mesh(5, 5)), path)
+    source = source_of(path)
+    mover = make_mover(source, Transform(), Frame())
+    rewrite(source, mover, moved)
+    lines = moved.read_bytes().split(b"\n")
+    middle = [line for line in lines if line.startswith(b"v ")][12]
+    words = middle.split(b" ")
+    words[3] = b"%.6f" % (float(words[3]) + 0.00001)
+    moved.unlink()
+    spoiled(monkeypatch, lambda text: text.replace(middle, b" ".join(words), 1))
+    with pytest.raises(OutputError, match=r"does not read back.*off by up to 1"):
+        rewrite(source, mover, moved)
+    assert not moved.exists()
+
+
+def test_lost_points_and_lines_are_noticed(tmp_path, monkeypatch):
+    _, source, mover = triangle(tmp_path)
+    spoiled(monkeypatch, lambda text: text.replace(b"v ", b"# ", 1))
+    with pytest.raises(OutputError, match="2 points of 3"):
+        rewrite(source, mover, tmp_path / "out.obj")
+    monkeypatch.undo()
+    spoiled(monkeypatch, lambda text: text.replace(b"\nf ", b"  f ", 1))
+    with pytest.raises(OutputError, match="lines of"):
         rewrite(source, mover, tmp_path / "out.obj")
     assert os.listdir(tmp_path) == ["reef.obj"]
-
-
-def test_lost_faces_are_noticed(tmp_path, monkeypatch):
-    _, source, mover = triangle(tmp_path)
-    real = obj_write.scan
-
-    def fewer(path):
-        found = real(path)
-        found.counts["faces"] -= 1
-        return found
-
-    monkeypatch.setattr(obj_write, "scan", fewer)
-    with pytest.raises(OutputError, match="faces differ"):
-        rewrite(source, mover, tmp_path / "out.obj")
 
 
 def test_numbers_too_large_for_fixed_notation_are_refused(tmp_path):
