@@ -10,7 +10,6 @@ import numpy as np
 from meshreg.judge import Judgement
 from meshreg.refine import Refined
 from meshreg.settings import SearchSettings
-from meshreg.tiles import MAX_YAW
 from meshreg.types import Float64, SurveyRaster, Transform
 from meshreg.voting import SMALL_YAW, Turn, vote
 
@@ -23,6 +22,11 @@ def turning(turn: Turn, centre: Float64) -> Transform:
     c, s = np.cos(turn.yaw), np.sin(turn.yaw)
     rotation = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     return Transform(rotation, turn.scale, np.zeros(3), centre)
+
+
+def yaw_of(motion: Transform) -> float:
+    """Return the angle [rad], counter-clockwise, by which a motion turns about the vertical."""
+    return float(np.arctan2(motion.rotation[1, 0], motion.rotation[0, 0]))
 
 
 def turned_as_voted(
@@ -53,17 +57,25 @@ def turned_as_voted(
 
 
 def on_heading_and_scale(
-    judgement: Judgement, yaw: float, scale: float, settings: SearchSettings, turn: Turn | None
+    judgement: Judgement,
+    yaw: float,
+    scale: float,
+    settings: SearchSettings,
+    turn: Turn | None,
+    motion: Transform | None,
 ) -> tuple[Judgement, tuple[str, ...]]:
     """Doubt a survey whose scale is plainly wrong, and tell what its heading is off by.
 
-    `yaw` [rad] and `scale` are those of the whole answer.
+    `yaw` [rad] and `scale` are those of the whole answer; `motion` is how the survey was turned
+    before the search.
     """
     notes: tuple[str, ...] = ()
-    if abs(yaw) > MAX_YAW:
+    turned = 0.0 if motion is None else yaw_of(motion)
+    if abs(turned) > SMALL_YAW:
         notes += (
-            f"the moving survey's heading is off: it was turned by {np.rad2deg(yaw):+.2f}° about "
-            "its centre before the search, and the methods' offsets are those of the turned survey",
+            f"the moving survey's heading is off by {np.rad2deg(-yaw):+.2f}°: it was turned by "
+            f"{np.rad2deg(turned):+.2f}° about its centre before the search, and the methods' "
+            "offsets are those of the turned survey",
         )
     if settings.free_scale and scale != 1.0:
         notes += (f"the moving survey's lengths are multiplied by {scale:.5f}",)
@@ -99,6 +111,6 @@ def as_delivered(refined: Refined, motion: Transform) -> Refined:
         refined,
         pivot=pivot,
         offset=refined.pivot + refined.offset - pivot,
-        yaw=refined.yaw + float(np.arctan2(motion.rotation[1, 0], motion.rotation[0, 0])),
+        yaw=refined.yaw + yaw_of(motion),
         tiles=tiles,
     )

@@ -23,6 +23,7 @@ from meshreg.ground import (
     numbered,
     slow_bending,
 )
+from meshreg.sandwich import block_sandwich
 from meshreg.types import Bool, Float64, Grid, SurveyRaster, Transform, UInt8, Warp
 
 MAX_TILT = np.deg2rad(3.0)
@@ -319,7 +320,7 @@ def _plane(
 
 
 def _covariance(plane: _Plane) -> Float64:
-    """Block sandwich ``H⁻¹ (sum_b g_b g_b') H⁻¹`` of (up, tilt_east, tilt_north)."""
+    """Covariance of (up, tilt_east, tilt_north)."""
     covariance, _ = _sandwich(plane)
     covariance[0, 0] += plane.choice**2
     return covariance
@@ -328,13 +329,9 @@ def _covariance(plane: _Plane) -> Float64:
 def _sandwich(plane: _Plane) -> tuple[Float64, int]:
     """Return the sandwich, and over how many parcels it was taken."""
     _, parcel = numbered(*(a // _parcel_side(plane) for a in plane.lattice))
-    count = int(parcel.max()) + 1
-    bread = np.linalg.pinv((plane.design * plane.cells[:, None]).T @ plane.design)
+    curvature = (plane.design * plane.cells[:, None]).T @ plane.design
     scores = plane.design * (plane.cells * plane.depart)[:, None]
-    sums = np.stack([np.bincount(parcel, scores[:, k], count) for k in range(3)], axis=1)
-    sums -= sums.mean(axis=0)
-    freedom = count / max(count - plane.terms, 0.2 * count)
-    return np.asarray(bread @ (sums.T @ sums) @ bread * freedom), count
+    return block_sandwich(curvature, scores, parcel, plane.terms), int(parcel.max()) + 1
 
 
 def _parcel_side(plane: _Plane) -> int:

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from meshreg.types import Bool, Float64
+from meshreg.types import Bool, Float64, Grid
 
 RANGES = (0.1, 0.2, 0.4, 0.8, 1.6)  # of the warp, in diagonals of the tiles' places
 # Of the warp in the variance. Never all of it: a tile is not the smooth warp itself, since the
@@ -31,6 +31,47 @@ class Ground:
 
     places: Float64
     share: Float64
+
+
+def overlap_ground(
+    masks: tuple[Bool, Bool],
+    grids: tuple[Grid, Grid],
+    offset: tuple[float, float] | Float64,
+    nodes: int,
+    step: int = 1,
+) -> Ground | None:
+    """Return up to about `nodes`² places of the moving survey's cells that fall on the reference's.
+
+    Parameters
+    ----------
+    masks : ((H, W), (h, w)) bool
+        Of reference and moving.
+    grids : (Grid, Grid)
+    offset : (east, north)
+        Of the moving survey [m].
+    nodes : int
+        Places along the overlap's longer side.
+    step : int
+        Only every so many rows and columns are looked at.
+
+    Returns
+    -------
+    Ground or None
+        None where no cell falls on another.
+    """
+    row, col = (index * step for index in np.nonzero(masks[1][::step, ::step]))
+    east, north = grids[1].east_north(row, col)
+    there = np.rint(np.stack(grids[0].row_col(east + offset[0], north + offset[1]))).astype(int)
+    inside = ((there >= 0) & (there < np.array(masks[0].shape)[:, None])).all(axis=0)
+    inside[inside] = masks[0][tuple(there[:, inside])]
+    if not inside.any():
+        return None
+    row, col, east, north = row[inside], col[inside], east[inside], north[inside]
+    side = int(max(np.ptp(row), np.ptp(col))) // nodes + 1
+    node = (row // side) * masks[1].shape[1] + col // side
+    _, node, count = np.unique(node, return_inverse=True, return_counts=True)
+    places = np.stack([np.bincount(node, east), np.bincount(node, north)], axis=1)
+    return Ground(places / count[:, None], count / count.sum())
 
 
 @dataclass(frozen=True, eq=False)

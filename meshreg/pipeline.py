@@ -35,7 +35,7 @@ from meshreg.heights import STABLE, Heights, fit_heights, stable_ground
 from meshreg.offsets import ESTIMATORS, estimate_offset, search_radius
 from meshreg.raster import rasterize
 from meshreg.raster.grid import choose_cells, coarsened, common_grid, survey_grids
-from meshreg.refine import Refined, overlap_ground, refine, with_scale
+from meshreg.refine import Refined, dem_ground, refine, with_scale
 from meshreg.settings import Settings
 from meshreg.surfaces import Polished, check_surfaces, polish
 from meshreg.types import (
@@ -311,14 +311,14 @@ def _in_frame(
         with clock.stage("refine"):
             refined = _refine(judgement, pairs, settings)
             if settings.search.free_scale or (motion is not None and motion.scale != 1.0):
-                ground = overlap_ground(*pairs["dem"], refined.offset)
+                ground = dem_ground(*pairs["dem"], refined.offset)
                 refined, scale = with_scale(refined, ground)
             if motion is not None:
                 refined, scale = as_delivered(refined, motion), scale * motion.scale
             heights = fit_heights(*first["dem"], _horizontal(refined, scale))
             judgement = judgement.doubted(refined.doubt).doubted(heights.doubt)
         judgement, notes = on_heading_and_scale(
-            judgement, refined.yaw, scale, settings.search, turn
+            judgement, refined.yaw, scale, settings.search, turn, motion
         )
     told = (notes, motion, scale)
     return Decision(tuple(estimates), judgement, refined, clock.seconds, heights, *told)

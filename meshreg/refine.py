@@ -14,9 +14,10 @@ from functools import partial
 
 import numpy as np
 
-from meshreg.kriging import Field, Ground, best_motion, design
+from meshreg.kriging import Field, Ground, best_motion, design, overlap_ground
 from meshreg.offsets import neutral
 from meshreg.offsets.surface import MAD_TO_SIGMA
+from meshreg.sandwich import block_sandwich
 from meshreg.tiles import MAX_YAW, Guess, Relief, TileOffsets, correlated_tiles, polished_tiles
 from meshreg.types import Float64, SurveyRaster
 
@@ -89,7 +90,7 @@ def refine(
     agree : float
         The refined offset may differ from the judged one by this much [m].
     """
-    ground = overlap_ground(rasters[0][0], rasters[0][1], offset)
+    ground = dem_ground(rasters[0][0], rasters[0][1], offset)
     centre = ground.share @ ground.places
     coarse = Refined(centre, np.array(offset), 0.0, _block_diagonal(sigma, MAX_YAW**2 / 9))
     tiles = _joined([correlated_tiles(a, b, channel, offset) for a, b, channel in rasters])
@@ -219,7 +220,7 @@ def fit(tiles: TileOffsets, pivot: Float64) -> Refined:
     """Robust rigid fit of tile offsets: ``d = t + yaw * (-(n - n0), e - e0)``.
 
     Tukey's biweight at 4 robust deviations, one deviation per channel. The covariance is the
-    block sandwich ``H⁻¹ (sum_b g_b g_b') H⁻¹``, since channels at one place err alike.
+    block sandwich (`meshreg.sandwich`), since channels at one place err alike.
     """
     columns = design(tiles.places, pivot, 3)
     middle = np.median(tiles.offsets, axis=0)
@@ -235,7 +236,9 @@ def fit(tiles: TileOffsets, pivot: Float64) -> Refined:
         if np.abs(step[:2]).max() < 1e-9:
             break
     residual = tiles.offsets - columns @ answer
-    covariance = _sandwich(columns, weights, residual, tiles.block)
+    normal = np.einsum("mij,m,mik->jk", columns, weights, columns)
+    scores = np.einsum("mij,m,mi->mj", columns, weights, residual)
+    covariance = block_sandwich(normal, scores, tiles.block, columns.shape[2])
     weights = weights / weights.max()
     return Refined(pivot, answer[:2], float(answer[2]), covariance, tiles, residual, weights)
 
@@ -258,16 +261,6 @@ def _scales(size: Float64, channel: np.ndarray) -> Float64:
     return scale
 
 
-def _sandwich(columns: Float64, weights: Float64, residual: Float64, block: np.ndarray) -> Float64:
-    bread = np.linalg.inv(np.einsum("mij,m,mik->jk", columns, weights, columns))
-    scores = np.einsum("mij,m,mi->mj", columns, weights, residual)
-    names = np.unique(block)
-    sums = np.array([scores[block == name].sum(axis=0) for name in names])
-    sums -= sums.mean(axis=0)
-    freedom = len(names) / max(len(names) - columns.shape[2], 1)
-    return np.asarray(bread @ (sums.T @ sums) @ bread * freedom)
-
-
 def _joined(found: Sequence[TileOffsets | None]) -> TileOffsets | None:
     """Tiles of both channels; blocks are by place, on a common lattice of the coarser tiles."""
     parts = [tiles for tiles in found if tiles is not None]
@@ -287,27 +280,18 @@ def _joined(found: Sequence[TileOffsets | None]) -> TileOffsets | None:
     )
 
 
-def overlap_ground(
+def dem_ground(
     reference: SurveyRaster, moving: SurveyRaster, offset: tuple[float, float] | Float64
 ) -> Ground:
     """Places [m] in the moving survey that stand for its cells that fall on reference cells."""
-    mask = moving.valid if moving.valid.any() else moving.color_valid
-    target = reference.valid if reference.valid.any() else reference.color_valid
-    row, col = np.nonzero(mask)
-    east, north = moving.grid.east_north(row, col)
-    r, c = reference.grid.row_col(east + offset[0], north + offset[1])
-    r, c = np.rint(r).astype(int), np.rint(c).astype(int)
-    rows, cols = reference.grid.shape
-    inside = (r >= 0) & (r < rows) & (c >= 0) & (c < cols)
-    inside[inside] = target[r[inside], c[inside]]
-    if not inside.any():
-        inside[:] = True
-    row, col, east, north = row[inside], col[inside], east[inside], north[inside]
-    block = int(max(np.ptp(row), np.ptp(col))) // NODES + 1
-    node = (row // block) * (cols + mask.shape[1]) + col // block
-    _, node, count = np.unique(node, return_inverse=True, return_counts=True)
-    places = np.stack([np.bincount(node, east), np.bincount(node, north)], axis=1)
-    return Ground(places / count[:, None], count / count.sum())
+    here, there = (
+        raster.valid if raster.valid.any() else raster.color_valid for raster in (moving, reference)
+    )
+    ground = overlap_ground((there, here), (reference.grid, moving.grid), offset, NODES)
+    if ground is None:  # it does not overlap there: all of it stands for what may
+        ground = overlap_ground((here, here), (moving.grid, moving.grid), (0.0, 0.0), NODES)
+    assert ground is not None
+    return ground
 
 
 def _block_diagonal(sigma: Float64, yaw_variance: float) -> Float64:

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from meshreg.errors import UsageError
+from meshreg.sandwich import block_sandwich
 from meshreg.types import Bool, Float64, Grid, Maps, Mesh, Survey, Transform
 
 GATE = 0.03  # m: points further apart have changed, or are not the same surface
@@ -229,8 +230,8 @@ def _agreement(fixed: Float64, normals: Float64, loose: Float64) -> tuple[float,
     """Rms distance [m] from the tangent planes, and the block covariance (6, 6) of the fit.
 
     With ``r = n . (p - q)`` and ``J = (n, p × n)``, weights by Tukey's biweight over the gate: the
-    sandwich ``H⁻¹ (sum_b g_b g_b') H⁻¹`` over square blocks of ground, as of the heights, since
-    neighbours err alike. Zero where fewer than two blocks a parameter are left.
+    sandwich (`meshreg.sandwich`) over square blocks of ground, as of the heights. Zero where fewer
+    than two blocks a parameter are left.
     """
     from scipy.spatial import cKDTree
 
@@ -252,10 +253,8 @@ def _agreement(fixed: Float64, normals: Float64, loose: Float64) -> tuple[float,
     if count < 12:
         return rms, np.zeros((6, 6))
     scores = design * (weight * along)[:, None]
-    sums = np.stack([np.bincount(block, scores[:, k], count) for k in range(6)], axis=1)
-    sums -= sums.mean(axis=0)
-    bread = np.linalg.pinv((design * weight[:, None]).T @ design, hermitian=True)
-    return rms, np.asarray(bread @ (sums.T @ sums) @ bread * count / (count - 6))
+    curvature = (design * weight[:, None]).T @ design
+    return rms, block_sandwich(curvature, scores, block, design.shape[1])
 
 
 def _proper(matrix: Float64) -> Transform:

@@ -601,7 +601,7 @@ class OffsetEstimate:
         Offset [m] to ADD to moving coordinates to lay them on the reference; NaN when failed.
     sigma : (2, 2) float64 or None
         Mean square error of (east, north) [m²], given that it is the right peak
-        (`meshreg.offsets.sandwich`).
+        (`meshreg.offsets.error_bars`).
     score : float
         The method's own measure at its best offset.
     gap : float

@@ -17,11 +17,11 @@ import numpy as np
 
 from meshreg.errors import UsageError
 from meshreg.offsets.correlate import Window
-from meshreg.offsets.sandwich import (
+from meshreg.offsets.error_bars import (
     FLOOR,
     correlated_blocks,
     error_bar,
-    overlap_ground,
+    ground_of,
     whole_shift,
 )
 from meshreg.offsets.surface import Peak
@@ -202,7 +202,7 @@ def _sigma(
     at, grids = (peak.east, peak.north), (reference.grid, moving.grid)
     fields = pairs(whole_shift(grids, peak.whole))
     blocks = correlated_blocks(fields, masks, grids, peak.whole, at)
-    ground = overlap_ground(masks, grids, at)
+    ground = ground_of(masks, grids, at)
     if blocks is None or ground is None:
         return peak.sigma
     sigma = error_bar(at, blocks, ground, FLOOR * moving.grid.cell)

@@ -19,7 +19,7 @@ import numpy as np
 
 from meshreg.offsets.channels import grey, local_normalised
 from meshreg.offsets.correlate import Correlator, Window, overlap_floor
-from meshreg.offsets.sandwich import laid
+from meshreg.offsets.error_bars import laid
 from meshreg.offsets.surface import Peak, find_peak
 from meshreg.settings import MutualInformationSettings, Settings
 from meshreg.types import Bool, Float64, SurveyRaster

@@ -17,8 +17,9 @@ from typing import Any
 
 import numpy as np
 
+from meshreg.offsets import correlate
 from meshreg.offsets.channels import grey, local_normalised
-from meshreg.offsets.sandwich import BLOCK, FLOOR, MOST, Blocks, error_bar, overlap_ground
+from meshreg.offsets.error_bars import BLOCK, FLOOR, MOST, Blocks, error_bar, ground_of
 from meshreg.settings import Settings, SiftSettings
 from meshreg.types import Bool, Float64, SurveyRaster, UInt8
 
@@ -53,7 +54,7 @@ def match(
     """Find features in both mosaics, match them and find the consensus within `radius` metres."""
     options = settings.sift
     robust = options.exhaustive_vote
-    with ThreadPoolExecutor(2) as both:
+    with ThreadPoolExecutor(correlate.WORKERS) as both:
         found = both.map(lambda raster: features(raster, options, robust), (reference, moving))
         (points1, descriptors1), (points2, descriptors2) = found
     pairs = nearest(descriptors2, descriptors1, options.ratio, settings.seed)
@@ -139,7 +140,7 @@ def nearest(query: Any, train: Any, ratio: float, seed: int) -> Any:
     def found(part: Any) -> Any:
         return index.knnSearch(part, 2, params={"checks": 64})
 
-    with ThreadPoolExecutor(2) as both:
+    with ThreadPoolExecutor(correlate.WORKERS) as both:
         halves = list(both.map(found, np.array_split(query, 2)))
     neighbour, squared = (np.concatenate(parts) for parts in zip(*halves, strict=True))
     kept = np.flatnonzero((squared[:, 0] < ratio**2 * squared[:, 1]) | (ratio >= 1))
@@ -222,7 +223,7 @@ def spread(
     evidence: Mapping[str, Any],
     inlier_radius: float,
 ) -> Float64:
-    """(2, 2) mean square error [m²] of the consensus, as its blocks tell it (`sandwich`).
+    """(2, 2) mean square error [m²] of the consensus, as its blocks tell it (`error_bars`).
 
     A block's own offset is the median of its matches within 2.5 inlier radii of the consensus:
     the inliers alone would not tell how far a block lies beyond their radius.
@@ -246,6 +247,6 @@ def spread(
     count = int(consensus.inliers.sum())
     blocks = Blocks(np.array(centres), np.array(own), np.array(slopes), -count * np.eye(2))
     masks, grids = (reference.color_valid, moving.color_valid), (reference.grid, moving.grid)
-    ground = overlap_ground(masks, grids, at)
+    ground = ground_of(masks, grids, at)
     sigma = None if ground is None else error_bar(at, blocks, ground, least)
     return np.eye(2) * inlier_radius**2 if sigma is None else sigma

@@ -11,7 +11,7 @@ import seafloor
 from scipy.stats import chi2
 
 from meshreg.kriging import Ground
-from meshreg.offsets import ESTIMATORS, estimate_offset, sandwich
+from meshreg.offsets import ESTIMATORS, error_bars, estimate_offset
 from meshreg.settings import Settings
 from meshreg.types import Grid
 
@@ -98,7 +98,7 @@ def test_rigid_surveys_keep_a_small_sigma(method):
 def test_block_scores_equal_brute_force():
     rng = np.random.default_rng(0)
     around, block = rng.normal(size=(3, 17, 17)), rng.normal(size=(3, 9, 9))
-    found = sandwich.block_scores(around, block)
+    found = error_bars.block_scores(around, block)
     assert found.shape == (3, 9, 9)
     for b in range(3):
         for i in range(9):
@@ -127,7 +127,7 @@ def test_blocks_of_a_shifted_field_give_the_shift_at_their_places(whole):
     masks = np.ones((90, 80), bool), inside
     near = tuple(true + np.clip(np.array(whole), -0.3, 0.3))
     near = tuple(np.round(np.array(near) / cell) * cell)
-    blocks = sandwich.correlated_blocks([(field, second)], masks, grids, near, near)
+    blocks = error_bars.correlated_blocks([(field, second)], masks, grids, near, near)
     assert np.isfinite(blocks.offsets).all(axis=1).mean() > 0.9
     np.testing.assert_allclose(np.nanmedian(blocks.offsets, axis=0), true, atol=0.02)
     east, north = grids[1].east_north(*(np.array([[0, 0], [69, 59]]).T))
@@ -143,7 +143,7 @@ def test_own_offsets_find_a_hill_and_refuse_the_rest():
     ]
     slope = steps[:, None] + 0.0 * steps  # highest on the edge
     twins = np.exp(-((steps - 4) ** 2 + steps[:, None] ** 2) / 2.0)
-    found = sandwich.own_offsets(np.array([*hills, slope, twins + twins[:, ::-1], 0 * twins]))
+    found = error_bars.own_offsets(np.array([*hills, slope, twins + twins[:, ::-1], 0 * twins]))
     np.testing.assert_allclose(found[:2], true, atol=0.03)
     assert np.isnan(found[2:]).all()
 
@@ -157,7 +157,7 @@ def test_the_sandwich_of_few_blocks_covers(count):
     for _ in range(1500):
         own = rng.normal(size=(count, 2)) @ spread.T
         mean = own.mean(axis=0)
-        covariance = sandwich.sandwich(own - mean, -count * np.eye(2))
+        covariance = error_bars.few_blocks(own - mean, -count * np.eye(2))
         hits.append(mean @ np.linalg.solve(covariance, mean) <= LEVEL)
     assert 0.93 < np.mean(hits) < 0.975
 
@@ -168,10 +168,10 @@ def test_too_few_blocks_leave_the_sandwich_or_nothing():
     ground = Ground(places, np.full(5, 0.2))
     slopes = rng.normal(0, 0.1, (5, 2))
     nothing = np.full((5, 2), np.nan)
-    blocks = sandwich.Blocks(places, nothing, slopes, -5 * np.eye(2))
-    found = sandwich.error_bar((0.0, 0.0), blocks, ground, 0.01)
+    blocks = error_bars.Blocks(places, nothing, slopes, -5 * np.eye(2))
+    found = error_bars.error_bar((0.0, 0.0), blocks, ground, 0.01)
     np.testing.assert_allclose(
-        found, sandwich.sandwich(slopes, -5 * np.eye(2)) + 0.01**2 * np.eye(2)
+        found, error_bars.few_blocks(slopes, -5 * np.eye(2)) + 0.01**2 * np.eye(2)
     )
     saddle = dataclasses.replace(blocks, curvature=np.diag([-1.0, 1.0]))
-    assert sandwich.error_bar((0.0, 0.0), saddle, ground, 0.01) is None
+    assert error_bars.error_bar((0.0, 0.0), saddle, ground, 0.01) is None

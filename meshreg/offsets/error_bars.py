@@ -10,8 +10,8 @@ from them by kriging (`meshreg.kriging`), and the stated covariance is the mean 
     sigma = (t - T)(t - T)' + cov(T)
 
 of the method's offset t, with T the blocks' best motion. Where too few blocks answer, it is the
-block sandwich of t itself, ``H⁻¹ (sum_b g_b g_b') H⁻¹``, g_b being the slope and H the curvature
-of the blocks' scores at t, widened for few blocks as Hotelling's T² is.
+block sandwich of t itself (`meshreg.sandwich`), from the slope and the curvature of the blocks'
+scores at t, widened for few blocks as Hotelling's T² is.
 """
 
 from __future__ import annotations
@@ -22,8 +22,9 @@ from typing import Any
 
 import numpy as np
 
-from meshreg.kriging import Ground, best_motion
+from meshreg.kriging import Ground, best_motion, overlap_ground
 from meshreg.offsets.surface import MAD_TO_SIGMA
+from meshreg.sandwich import block_sandwich
 from meshreg.types import Bool, Float64, Grid
 
 BLOCK = 2.0  # m: several times the length over which high-passed heights or grey are alike
@@ -70,7 +71,7 @@ def error_bar(
         The method's offset [m].
     blocks : Blocks
     ground : Ground
-        The overlap (`overlap_ground`).
+        The overlap (`ground_of`).
     floor : float
         Deviation per axis [m] that is always there.
 
@@ -88,46 +89,32 @@ def error_bar(
         )
         miss = np.asarray(at) - best.answer[:2]
         return np.asarray(np.outer(miss, miss) + best.covariance[:2, :2] + least)
-    covariance = sandwich(blocks.slopes, blocks.curvature)
+    covariance = few_blocks(blocks.slopes, blocks.curvature)
     return None if covariance is None else covariance + least
 
 
-def sandwich(slopes: Float64, curvature: Float64) -> Float64 | None:
-    """Block sandwich ``H⁻¹ (sum_b g_b g_b') H⁻¹ B / (B - 1)``, widened for few blocks.
+def few_blocks(slopes: Float64, curvature: Float64) -> Float64 | None:
+    """Block sandwich (2, 2) of a peak, widened for few blocks; None where it has no meaning.
 
     A 95 % ellipse of two degrees of freedom is drawn at chi-square's 5.99; with B blocks it takes
     Hotelling's ``T² = 2 (B - 1) / (B - 2) F(2, B - 2)``, and the covariance grows by their ratio.
     """
     from scipy.special import chdtri, fdtri
 
-    count = int((slopes != 0).any(axis=1).sum())
+    slopes = slopes[(slopes != 0).any(axis=1)]
+    count = len(slopes)
     if count < 4 or not np.linalg.eigvalsh(curvature)[-1] < 0:
         return None
-    inverse = np.linalg.inv(curvature)
-    covariance = inverse @ (slopes.T @ slopes) @ inverse * (count / (count - 1))
+    covariance = block_sandwich(curvature, slopes, np.arange(count), 1)
     hotelling = 2 * (count - 1) / (count - 2) * fdtri(2, count - 2, 0.95)
     return np.asarray(covariance * (hotelling / chdtri(2, 0.05)))
 
 
-def overlap_ground(
+def ground_of(
     masks: tuple[Bool, Bool], grids: tuple[Grid, Grid], at: tuple[float, float]
 ) -> Ground | None:
-    """Places that stand for the moving cells that fall on reference cells; every few cells only."""
-    step = max(1, max(masks[1].shape) // 120)
-    row, col = np.nonzero(masks[1][::step, ::step])
-    row, col = row * step, col * step
-    east, north = grids[1].east_north(row, col)
-    r, c = (np.rint(i).astype(int) for i in grids[0].row_col(east + at[0], north + at[1]))
-    inside = (r >= 0) & (r < masks[0].shape[0]) & (c >= 0) & (c < masks[0].shape[1])
-    inside[inside] = masks[0][r[inside], c[inside]]
-    if not inside.any():
-        return None
-    row, col, east, north = row[inside], col[inside], east[inside], north[inside]
-    side = int(max(np.ptp(row), np.ptp(col))) // MOST + 1
-    node = ((row - row.min()) // side) * (MOST + 1) + (col - col.min()) // side
-    _, node, count = np.unique(node, return_inverse=True, return_counts=True)
-    places = np.stack([np.bincount(node, east), np.bincount(node, north)], axis=1)
-    return Ground(places / count[:, None], count / count.sum())
+    """Return the overlap at an offset [m], from every few cells: it is asked for in every pair."""
+    return overlap_ground(masks, grids, at, MOST, max(1, max(masks[1].shape) // 120))
 
 
 def correlated_blocks(
