@@ -1,7 +1,9 @@
-"""Ground that has not changed, found without being told where it is: by majority.
+"""Ground that has not changed, found without being told where it is: by its detail, by majority.
 
-Within a block of cells the ground is where most cells agree; among the blocks, what departs from
-the slow bending of all the others, or from its neighbours, has changed as a whole.
+Sand that has risen or fallen as a sheet may be most of what is seen, but it does not look the same
+again: ground whose small relief recurs is the same ground. Within a block of such cells the ground
+is where most of them agree; among the blocks, what departs from the slow bending of all the others,
+or from its neighbours, has changed as a whole.
 """
 
 from __future__ import annotations
@@ -14,9 +16,39 @@ from meshreg.types import Bool, Float64
 Index = NDArray[np.int_]
 MAD_TO_SIGMA = 1.4826
 HALF_WIDTH = 1.349  # the shortest half of a normal distribution is this many sigmas wide
+QUARTER = 0.3186  # sigmas: a quarter of a normal distribution lies nearer to its middle
 CUT = 2.5  # sigmas; what lies further from a block's ground has changed
 BLOCK_CUT = 4.0  # robust deviations at which a block is not believed
 ROUNDING = 1e-9  # m
+DETAIL = 2.0  # cells: the mean around a cell, from which its detail is measured
+SEEN = 7  # cells: side of the square over which detail is compared; a few of it are independent
+RECURS = 0.6  # correlation there; by chance it is 0 +- 0.3
+
+
+def recurring(first: Float64, second: Float64, known: Bool) -> Bool:
+    """Return where two height maps on one grid show the same detail, (H, W) bool.
+
+    Parameters
+    ----------
+    first, second : (H, W) float64
+        Heights [m], any values where they are not `known`.
+    known : (H, W) bool
+    """
+    from scipy.ndimage import gaussian_filter, uniform_filter
+
+    weight = np.maximum(gaussian_filter(known.astype(np.float64), DETAIL, truncate=3.0), 1e-6)
+
+    def detail(height: Float64) -> Float64:
+        level = np.where(known, height - np.median(height[known]), 0.0)
+        return np.where(known, level - gaussian_filter(level, DETAIL, truncate=3.0) / weight, 0.0)
+
+    def around(products: Float64) -> Float64:
+        return np.asarray(uniform_filter(products, SEEN, mode="constant"))
+
+    one, other = detail(first), detail(second)
+    size = around(one**2).clip(0) * around(other**2).clip(0)
+    alike = np.divide(around(one * other), np.sqrt(size), out=np.zeros_like(one), where=size > 0)
+    return np.asarray(known & (alike >= RECURS))
 
 
 def block_grounds(
@@ -58,36 +90,71 @@ def shortest_half(values: Float64, cells: Index) -> tuple[Float64, Float64]:
     return mean, width[rows, best] / HALF_WIDTH
 
 
-def slow_bending(arm: Float64, weight: Float64, value: Float64) -> tuple[Float64, int]:
-    """Slow bending of the models at the blocks [m], a cubic or less, and its number of terms.
+def largest_sheet(lattice: Index, value: Float64, weight: Float64, least: float = 0.0) -> Bool:
+    """Return which blocks (B,) belong to the largest piece of ground without a step in it.
 
-    Least trimmed squares over half of the blocks, by concentration steps from a level start and
-    from all blocks (Rousseeuw and Van Driessen 2006): up to half of the ground may have changed.
+    Models bend, but they do not tear: ground that slid, fell or was heaped up as a whole stands
+    apart from what is beside it by a step, however much both bend. A step is over four deviations
+    of what two neighbours differ by as a rule, for each block's width between them.
+
+    Parameters
+    ----------
+    lattice : (B, 2) int
+        Row and column of each block, from 0.
+    value : (B,) float64
+        Its height difference [m].
+    weight : (B,) float64
+        Its size.
+    least : float
+        No lower step is one [m].
     """
-    degree = int(np.clip(np.sqrt(0.2 * len(value)), 1, 3))
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    start, end, far = _beside(lattice)
+    steps = np.abs(value[start] - value[end]) / far
+    usual = float(np.quantile(steps, 0.25)) / QUARTER  # most steps may be at the rim of something
+    joined = steps <= max(BLOCK_CUT * usual, least) + ROUNDING
+    links = coo_array((far[joined], (start[joined], end[joined])), shape=2 * (len(lattice),))
+    _, piece = connected_components(links, directed=False)
+    return np.asarray(piece == np.argmax(np.bincount(piece, weight)))
+
+
+def _beside(lattice: Index) -> tuple[Index, Index, Float64]:
+    """Pairs of blocks with no other between them, across gaps too, and how far they are apart.
+
+    Gabriel's graph (Gabriel and Sokal 1969): no third block in the circle about both.
+    """
+    from scipy.spatial import Delaunay, QhullError, cKDTree
+
+    try:
+        corners = Delaunay(lattice).simplices
+    except QhullError:  # all in one line
+        corners = Delaunay(lattice, qhull_options="QJ").simplices
+    edges = np.sort(np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]]))
+    start, end = np.unique(edges, axis=0).T
+    far = np.hypot(*(lattice[start] - lattice[end]).T)
+    third, _ = cKDTree(lattice).query(0.5 * (lattice[start] + lattice[end]))
+    kept = third >= 0.5 * far - ROUNDING
+    return start[kept], end[kept], far[kept]
+
+
+def slow_bending(
+    arm: Float64, weight: Float64, value: Float64, told: Bool
+) -> tuple[Float64, int]:
+    """Slow bending of the models at all blocks [m] and its number of terms, from those `told`.
+
+    A cubic in both directions, or less where blocks are few.
+    """
+    degree = int(np.clip(np.sqrt(0.2 * told.sum()), 1, 3))
     x, y = (arm / np.abs(arm).max()).T
     powers = [(i, j) for i in range(degree + 1) for j in range(degree + 1 - i)]
     design = np.stack([x**i * y**j for i, j in powers], axis=1)
-    half = max((len(value) + len(powers) + 1) // 2, len(powers) + 1)
-    mode, _ = shortest_half(np.sort(value)[None, :], np.array([len(value)]))
-    tried = []
-    for start in (np.full(len(value), mode[0]), design @ least_squares(design, weight, value)):
-        bent = start
-        for _ in range(20):
-            near = np.argsort(np.abs(value - bent), kind="stable")[:half]
-            solved = least_squares(design[near], weight[near], value[near])
-            before, bent = bent, design @ solved
-            if np.abs(bent - before).max() < 1e-9:
-                break
-        tried.append((float(np.sort((value - bent) ** 2)[:half].sum()), bent))
-    bent = min(tried, key=lambda trial: trial[0])[1]
-    scale = MAD_TO_SIGMA * float(np.median(np.abs(value - bent)))
-    kept = np.abs(value - bent) <= BLOCK_CUT * scale + ROUNDING
-    return design @ least_squares(design[kept], weight[kept], value[kept]), len(powers)
+    return design @ least_squares(design[told], weight[told], value[told]), len(powers)
 
 
 def neighbours(lattice: Index, value: Float64) -> Float64:
-    """Median of each block's 5 × 5 neighbourhood; NaN is left out, 0 where nothing is left."""
+    """Median of each block's 5 × 5 neighbourhood; NaN is left out, and the answer without any."""
     from scipy.ndimage import generic_filter
 
     table = np.full(lattice.max(axis=0) + 1, np.nan)
@@ -98,7 +165,7 @@ def neighbours(lattice: Index, value: Float64) -> Float64:
 
 def _median_known(values: Float64) -> float:
     known = values[~np.isnan(values)]
-    return float(np.median(known)) if known.size else 0.0
+    return float(np.median(known)) if known.size else np.nan
 
 
 def numbered(row: Index, col: Index) -> tuple[Index, Index]:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
 from meshreg.judge import Judgement
 from meshreg.refine import Refined
 from meshreg.settings import SearchSettings
+from meshreg.tiles import Guess
 from meshreg.types import Float64, SurveyRaster, Transform
 from meshreg.voting import SMALL_YAW, Turn, vote
 
@@ -113,4 +115,12 @@ def as_delivered(refined: Refined, motion: Transform) -> Refined:
         offset=refined.pivot + refined.offset - pivot,
         yaw=refined.yaw + yaw_of(motion),
         tiles=tiles,
+        offset_at=refined.offset_at and partial(_offset_at, refined.offset_at, motion),
     )
+
+
+def _offset_at(turned: Guess, motion: Transform, places: Float64) -> Float64:
+    """Offset (N, 2) [m] of places as delivered, from that of the turned ones."""
+    points = np.column_stack([places, np.full(len(places), motion.pivot[2])])
+    there = motion.apply(points)[:, :2]
+    return np.asarray(there + turned(there) - places)

@@ -1,14 +1,16 @@
 """Height and tilt, once east, north and yaw are known.
 
-Robust against change, yet uniform over the ground: growth, loss and loose things are left out
-inside each block of cells, and a block that says nothing is told by its neighbours, but the slow
-bending of the models is kept with equal weight everywhere. So the answer is the best rigid fit
+Robust against change, yet uniform over the ground: sand that moved as a sheet, growth, loss and
+loose things are left out, and a block that departs from its neighbours is told by them, but the
+slow bending of the models is kept with equal weight everywhere. So the answer is the best rigid fit
 over all ground that both surveys see, not the fit to where the models happen to agree.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -18,9 +20,11 @@ from meshreg.ground import (
     ROUNDING,
     Index,
     block_grounds,
+    largest_sheet,
     least_squares,
     neighbours,
     numbered,
+    recurring,
     slow_bending,
 )
 from meshreg.sandwich import block_sandwich
@@ -28,6 +32,13 @@ from meshreg.types import Bool, Float64, Grid, SurveyRaster, Transform, UInt8, W
 
 MAX_TILT = np.deg2rad(3.0)
 MIN_BLOCKS = 12
+LEAST_RECURRING = 0.1  # share of the common cells; with less, all of them are asked
+# m, sigma: how far sand may have risen or fallen where nothing tells; by then up is no better known
+# than by two depths of 5 cm each.
+SHEET = 0.07
+LEAST_STEP = 0.1  # cells: what parts two blocks that did not change alike is higher than that
+BEND_STEP = 8  # cells between the places at which the bending is computed
+OffsetAt = Callable[[Float64], Float64]
 # What a cell of ground was for the height and the tilt: not compared; changed against the ground
 # around it; in a block that changed as a whole, which is told by its neighbours; counted.
 UNKNOWN, CHANGED, SET_ASIDE, STABLE = range(4)
@@ -99,21 +110,28 @@ def rotation(tilt: Float64) -> Float64:
     )
 
 
-def fit_heights(reference: SurveyRaster, moving: SurveyRaster, horizontal: Transform) -> Heights:
+def fit_heights(
+    reference: SurveyRaster,
+    moving: SurveyRaster,
+    horizontal: Transform,
+    offset_at: OffsetAt | None = None,
+) -> Heights:
     """Lift and tilt of the moving survey, from raw height differences.
 
     The difference ``dz = reference - moving`` at a moved cell is modelled as
-    ``up + tilt_east * (n - n0) - tilt_north * (e - e0)``. Each block's ground is the trimmed mean
-    around the centre of its shortest half (least trimmed squares: Rousseeuw and Leroy 1987,
-    chapter 4), a block that departs from its neighbours by over four deviations is told by them,
-    and the plane is the least-squares fit with a weight of one for each common cell. Since the
-    moved cells are looked up anew after each step, relief does not bias a large tilt.
+    ``up + tilt_east * (n - n0) - tilt_north * (e - e0)``. Cells count where the detail of their
+    surroundings recurs (`meshreg.ground.recurring`). Each block's ground is the trimmed mean of
+    those around the centre of its shortest half (least trimmed squares: Rousseeuw and Leroy 1987,
+    chapter 4), blocks that a step or four deviations part from their neighbours are told by them,
+    and the plane is the least-squares fit with a weight of one for each cell. Since the moved cells
+    are looked up anew after each step, relief does not bias a large tilt.
 
-    The covariance is the block sandwich of the blocks' departures from a slow bending (a cubic in
-    east and north), over parcels at least two correlation lengths of these departures wide: the
-    slow bending itself moves the best fit over all ground as much as this one. Added to the
-    variance of `up` is the square of how much it changes if nothing is left out (median of all
-    cells): when much has changed, what counts as stable ground is a choice.
+    The covariance is the block sandwich (`meshreg.sandwich`) of the blocks' departures from their
+    neighbours for `up`, from a slow bending (a cubic in east and north) for the tilt, over parcels
+    at least two correlation lengths of these departures wide: the slow bending itself moves the
+    best fit over all ground as much as this one. Added to the variance of `up` are the squares of how much it changes if nothing is left out (median of all
+    cells: when much has changed, what counts as stable ground is a choice), and of what the bending
+    may do where no ground counts.
 
     Parameters
     ----------
@@ -121,71 +139,141 @@ def fit_heights(reference: SurveyRaster, moving: SurveyRaster, horizontal: Trans
         DEMs as delivered, each on its own grid.
     horizontal : Transform
         `reference_from_moving` in east, north and yaw.
+    offset_at : callable, optional
+        ``offset_at(places)`` of places (N, 2) in the moving survey: how far the ground there must
+        go [m], (N, 2), internal warp included. Heights are compared there, where the same ground
+        is; without it, where the rigid motion leads.
 
     Returns
     -------
     Heights
-        With the tilt at zero unless Hotelling's T² calls it significant at three sigmas (0.27 %).
+        With the tilt at zero unless Hotelling's T² calls it significant at three sigmas (0.27 %);
+        the covariance knows what that leaves out.
     """
-    surface = _Surface.of(reference)
-    place = _centroid(surface, moving, horizontal)
-    if place is None:
+    pair = _Pair.of(reference, moving, horizontal, offset_at)
+    if not pair.row.size:
         return Heights(horizontal.pivot, note="no heights in common; up is not known")
+    place = _points(moving, pair.row, pair.col).mean(axis=0)
     start = Heights(place)
-    start = replace(start, up=_median_step(surface, moving, start.transform(horizontal)))
-    free, plane = _settled(surface, moving, horizontal, start, tilted=True)
+    first = pair.differences(start.transform(horizontal))[0]
+    start = replace(start, up=float(np.median(first)))
+    pair, note = pair.where_detail_recurs(start.transform(horizontal))
+    free, plane = _settled(pair, horizontal, start, tilted=True)
     if plane is None:
-        return _unblocked(surface, moving, horizontal, start)
+        return _unblocked(pair, horizontal, start)
     tilt = float(np.hypot(*free.tilt))
-    if _significant(free.tilt, plane) and tilt > MAX_TILT:
+    significant = _significant(free.tilt, plane)
+    loose = np.zeros((3, 3))
+    if note:
+        loose[0, 0] = SHEET**2
+    if significant and tilt > MAX_TILT:
         degrees = np.rad2deg(tilt)
         doubt = f"the surveys are tilted against each other by {degrees:.1f}°, beyond 3°"
-        level, _ = _settled(surface, moving, horizontal, start, tilted=False)
-        return replace(level, covariance=_covariance(plane), doubt=doubt)
-    if not _significant(free.tilt, plane):
-        level, found = _settled(surface, moving, horizontal, start, tilted=False)
-        free, plane = (level, found) if found is not None else (free, plane)
-    return replace(free, covariance=_covariance(plane), kept=plane.kept, sigma=plane.sigma)
+        level, _ = _settled(pair, horizontal, start, tilted=False)
+        return replace(level, covariance=_covariance(plane) + loose, doubt=doubt, note=note)
+    if not significant:
+        level, found = _settled(pair, horizontal, start, tilted=False)
+        if found is not None:
+            loose[1:, 1:] = np.outer(free.tilt, free.tilt)
+            free, plane = level, found
+    covariance = _covariance(plane) + loose
+    return replace(free, covariance=covariance, kept=plane.kept, sigma=plane.sigma, note=note)
 
 
 @dataclass(frozen=True, eq=False)
-class _Surface:
-    """The reference's heights as a cubic spline, and where its cells can be trusted."""
+class _Pair:
+    """Both DEMs, ready to be compared at any lift and tilt.
 
-    raster: SurveyRaster
+    The reference's heights are a cubic spline; `inner` tells where its cells can be trusted. The
+    moving cells (N,) that fall there are compared, `bend` [m] (N, 2) beside where the rigid motion
+    leads; those in `counts` tell the answer.
+    """
+
+    reference: SurveyRaster
+    moving: SurveyRaster
     spline: Float64
     base: float
-    inner: Bool
+    row: Index
+    col: Index
+    bend: Float64
+    counts: Bool
 
     @classmethod
-    def of(cls, raster: SurveyRaster) -> _Surface:
+    def of(
+        cls,
+        reference: SurveyRaster,
+        moving: SurveyRaster,
+        horizontal: Transform,
+        offset_at: OffsetAt | None,
+    ) -> _Pair:
         from scipy.ndimage import binary_erosion, distance_transform_edt, spline_filter
 
-        if not raster.valid.any():
-            return cls(raster, np.zeros(raster.grid.shape), 0.0, raster.valid)
+        row, col = np.nonzero(moving.valid)
+        nothing = np.zeros((0, 2))
+        if not reference.valid.any() or not row.size:
+            none = row[:0]
+            flat = np.zeros(reference.grid.shape)
+            return cls(reference, moving, flat, 0.0, none, none, nothing, none.astype(bool))
         # empty cells take their nearest neighbour's height, lest the spline ring at the edges
-        near = distance_transform_edt(~raster.valid, return_distances=False, return_indices=True)
-        height = raster.height.astype(np.float64)[tuple(near)]
+        near = distance_transform_edt(~reference.valid, return_distances=False, return_indices=True)
+        height = reference.height.astype(np.float64)[tuple(near)]
         base = float(np.median(height))
-        inner = binary_erosion(raster.valid, np.ones((3, 3)), border_value=1)
-        return cls(raster, spline_filter(height - base, 3), base + raster.datum, inner)
+        inner = binary_erosion(reference.valid, np.ones((3, 3)), border_value=1)
+        bend = _bend(moving, horizontal, offset_at)[row, col]
+        there = horizontal.apply(_points(moving, row, col))[:, :2] + bend
+        at = np.rint(np.stack(reference.grid.row_col(*there.T))).astype(int)
+        inside = ((at >= 0) & (at < np.array(inner.shape)[:, None])).all(axis=0)
+        inside[inside] = inner[tuple(at[:, inside])]
+        spline, row, col = spline_filter(height - base, 3), row[inside], col[inside]
+        base, everything = base + reference.datum, np.ones(len(row), bool)
+        return cls(reference, moving, spline, base, row, col, bend[inside], everything)
 
-    def differences(
-        self, moving: SurveyRaster, transform: Transform
-    ) -> tuple[Float64, Float64, Index, Index]:
-        """Return reference less moved height [m], the moved points (N, 3), their row and column."""
+    @cached_property
+    def points(self) -> Float64:
+        """(N, 3) [m] as the moving survey was delivered."""
+        return _points(self.moving, self.row, self.col)
+
+    def differences(self, transform: Transform) -> tuple[Float64, Float64]:
+        """Return reference less moved height [m] of each cell, and the moved points (N, 3)."""
         from scipy.ndimage import map_coordinates
 
-        row, col = np.nonzero(moving.valid)
-        points = transform.apply(_points(moving, row, col))
-        at = np.stack(self.raster.grid.row_col(points[:, 0], points[:, 1]))
-        near = np.rint(at).astype(int)
-        rows, cols = self.raster.grid.shape
-        inside = (near[0] >= 0) & (near[0] < rows) & (near[1] >= 0) & (near[1] < cols)
-        inside[inside] = self.inner[near[0, inside], near[1, inside]]
-        at, points = at[:, inside], points[inside]
+        points = transform.apply(self.points)
+        there = points[:, :2] + self.bend
+        at = np.stack(self.reference.grid.row_col(*there.T))
         height = map_coordinates(self.spline, at, order=3, prefilter=False, mode="mirror")
-        return height + self.base - points[:, 2], points, row[inside], col[inside]
+        return height + self.base - points[:, 2], points
+
+    def where_detail_recurs(self, transform: Transform) -> tuple[_Pair, str]:
+        """Return the pair that counts only recurring ground; all, and why, where there is little."""
+        difference, points = self.differences(transform)
+        known = np.zeros(self.moving.grid.shape, bool)
+        known[self.row, self.col] = True
+        heights = np.zeros((2, *known.shape))
+        heights[:, self.row, self.col] = points[:, 2] + difference, points[:, 2]
+        counts = recurring(*heights, known)[self.row, self.col]
+        if counts.mean() < LEAST_RECURRING:
+            return self, (
+                "no ground shows the same small relief in both surveys: if it rose or fell as a "
+                f"whole (sand), up is off by as much; ±{100 * SHEET:g} cm is added for that"
+            )
+        return replace(self, counts=counts), ""
+
+
+def _bend(moving: SurveyRaster, horizontal: Transform, offset_at: OffsetAt | None) -> Float64:
+    """(H, W, 2) [m]: where each moving cell's ground is, beside where the rigid motion leads."""
+    from scipy.ndimage import map_coordinates
+
+    shape = moving.grid.shape
+    if offset_at is None:
+        return np.zeros((*shape, 2))
+    axes = [np.arange(0, length + BEND_STEP, BEND_STEP) for length in shape]
+    row, col = np.meshgrid(*axes, indexing="ij")
+    places = np.stack(moving.grid.east_north(row.ravel(), col.ravel()), axis=1)
+    level = np.column_stack([places, np.full(len(places), horizontal.pivot[2])])
+    beside = places + offset_at(places) - horizontal.apply(level)[:, :2]
+    at = np.indices(shape) / BEND_STEP
+    parts = [map_coordinates(part.reshape(row.shape), at, order=1) for part in beside.T]
+    return np.stack(parts, axis=-1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,10 +283,12 @@ class _Plane:
     step: Float64  # (3,) up [m], tilt about east and north [rad]
     design: Float64  # (B, 3)
     cells: Float64  # (B,) common cells: the weights
-    depart: Float64  # (B,) from the neighbours [m]; 0 where a block was not believed
+    depart: Float64  # (B,) from the slow bending [m]; 0 where a block was not believed
+    noise: Float64  # (B,) from the neighbours [m]; likewise
     lattice: tuple[Index, Index]  # (B,) row and column of the blocks
     terms: int  # of the bending that `depart` is free of
     choice: float  # change of up if nothing is left out [m]
+    unseen: float  # change of up that the bending may make where no ground counts [m]
     kept: float
     sigma: float
     ground: UInt8  # (H, W) of the moving DEM
@@ -233,28 +323,13 @@ def _points(raster: SurveyRaster, row: Index, col: Index) -> Float64:
     return np.stack([east, north, up], axis=1)
 
 
-def _centroid(surface: _Surface, moving: SurveyRaster, horizontal: Transform) -> Float64 | None:
-    _, _, row, col = surface.differences(moving, horizontal)
-    return _points(moving, row, col).mean(axis=0) if len(row) else None
-
-
-def _median_step(surface: _Surface, moving: SurveyRaster, transform: Transform) -> float:
-    return float(np.median(surface.differences(moving, transform)[0]))
-
-
 def _settled(
-    surface: _Surface,
-    moving: SurveyRaster,
-    horizontal: Transform,
-    start: Heights,
-    *,
-    tilted: bool,
+    pair: _Pair, horizontal: Transform, start: Heights, *, tilted: bool
 ) -> tuple[Heights, _Plane | None]:
     """Step until the plane lies still; None where the blocks are too few."""
     answer, plane = start, None
     for _ in range(8):
-        whole = answer.transform(horizontal)
-        plane = _plane(surface, moving, whole, tilted=tilted)
+        plane = _plane(pair, answer.transform(horizontal), start.place, tilted=tilted)
         if plane is None:
             return answer, None
         tilt = answer.tilt + plane.step[1:]
@@ -267,78 +342,93 @@ def _settled(
     return answer, plane
 
 
-def _plane(
-    surface: _Surface, moving: SurveyRaster, transform: Transform, *, tilted: bool
-) -> _Plane | None:
-    difference, points, row, col = surface.differences(moving, transform)
-    if len(row) == 0:
+def _plane(pair: _Pair, transform: Transform, place: Float64, *, tilted: bool) -> _Plane | None:
+    difference, points = pair.differences(transform)
+    row, col, counts = pair.row, pair.col, pair.counts
+    if not counts.any():
         return None
     span = min(np.ptp(row), np.ptp(col)) + 1
     side = int(np.clip(span // 20, 8, 16))
-    block, number = numbered(row // side, col // side)
-    ground, cells, kept, held = block_grounds(difference, number, block.shape[0])
+    block, number = numbered(row[counts] // side, col[counts] // side)
+    ground, cells, kept, held = block_grounds(difference[counts], number, block.shape[0])
     known = cells >= 0.25 * side**2
     if known.sum() < MIN_BLOCKS:
         return None
     middle = np.stack(
-        [np.bincount(number, points[:, k], len(cells)) / cells for k in (0, 1)], axis=1
+        [np.bincount(number, points[counts, k], len(cells)) / cells for k in (0, 1)], axis=1
     )
-    centre = (middle * cells[:, None]).sum(axis=0) / cells.sum()
-    arm = (middle - centre)[known]
+    arm = (middle - transform.apply(place)[:2])[known]
     design = np.stack([np.ones(len(arm)), arm[:, 1], -arm[:, 0]], axis=1)
     value, weight = ground[known], cells[known].astype(np.float64)
-    bent, terms = slow_bending(arm, weight, value)
-    rest = value - bent
-    wild = np.abs(rest) > BLOCK_CUT * MAD_TO_SIGMA * float(np.median(np.abs(rest))) + ROUNDING
     lattice = block[known] - block[known].min(axis=0)
+    wild = ~largest_sheet(lattice, value, weight, LEAST_STEP * pair.moving.grid.cell)
+    bent, terms = slow_bending(arm, weight, value, ~wild)
+    rest = value - bent
     around = neighbours(lattice, np.where(wild, np.nan, rest))
     depart = rest - around
     sigma = MAD_TO_SIGMA * float(np.median(np.abs(depart[~wild])))
     wild |= np.abs(depart) > BLOCK_CUT * sigma + ROUNDING
+    told = np.isfinite(around)  # far from all that are believed nothing tells a block's height
+    weight = np.where(told, weight, 0.0)
+    around = np.where(told, around, rest)
     value = np.where(wild, bent + around, value)
-    step = least_squares(design, weight, value) if tilted else np.zeros(3)
-    step[0] = np.average(value, weights=weight)
+    step = least_squares(design, weight, value)
+    bending = np.sqrt(np.average((value - design @ step) ** 2, weights=weight))
+    if not tilted:
+        step = np.array([np.average(value, weights=weight), 0.0, 0.0])
     believed = np.full(len(cells), UNKNOWN, np.uint8)
     believed[known] = np.where(wild, SET_ASIDE, STABLE)
-    state = np.zeros(moving.grid.shape, np.uint8)
-    state[row, col] = np.where((believed[number] == STABLE) & ~held, CHANGED, believed[number])
-    flat = difference - step[0]
-    if tilted:
-        flat = flat - step[1] * (points[:, 1] - centre[1]) + step[2] * (points[:, 0] - centre[0])
+    state = np.zeros(pair.moving.grid.shape, np.uint8)
+    state[row, col] = CHANGED
+    counted = np.where((believed[number] == STABLE) & ~held, CHANGED, believed[number])
+    state[row[counts], col[counts]] = counted
+    turned = points[:, :2] - transform.apply(place)[:2]
+    flat = difference - np.column_stack([np.ones(len(row)), turned[:, 1], -turned[:, 0]]) @ step
     return _Plane(
         step,
         design,
         weight,
         np.where(wild, 0.0, rest),
+        np.where(wild, 0.0, rest - around),
         (lattice[:, 0], lattice[:, 1]),
         terms,
         float(np.median(flat)),
-        float((kept[known] * weight)[~wild].sum() / weight.sum()),
+        float(1.0 - weight.sum() / len(row)) * float(bending),
+        float((kept[known] * weight)[~wild].sum() / len(row)),
         sigma,
         state,
     )
 
 
 def _covariance(plane: _Plane) -> Float64:
-    """Covariance of (up, tilt_east, tilt_north)."""
-    covariance, _ = _sandwich(plane)
-    covariance[0, 0] += plane.choice**2
+    """Covariance of (up, tilt_east, tilt_north).
+
+    The bending's mean over all ground belongs to `up`; only what departs from the neighbours makes
+    that err. A tilt hangs on the rim, and with it on how the models bend there.
+    """
+    covariance, _ = _sandwich(plane, plane.depart)
+    alone, _ = _sandwich(plane, plane.noise)
+    if covariance[0, 0] > alone[0, 0]:
+        less = np.sqrt(alone[0, 0] / covariance[0, 0])
+        covariance[0] *= less
+        covariance[:, 0] *= less
+    covariance[0, 0] += plane.choice**2 + plane.unseen**2
     return covariance
 
 
-def _sandwich(plane: _Plane) -> tuple[Float64, int]:
-    """Return the sandwich, and over how many parcels it was taken."""
-    _, parcel = numbered(*(a // _parcel_side(plane) for a in plane.lattice))
+def _sandwich(plane: _Plane, errors: Float64) -> tuple[Float64, int]:
+    """Return the sandwich of the blocks' errors, and over how many parcels it was taken."""
+    _, parcel = numbered(*(a // _parcel_side(plane, errors) for a in plane.lattice))
     curvature = (plane.design * plane.cells[:, None]).T @ plane.design
-    scores = plane.design * (plane.cells * plane.depart)[:, None]
+    scores = plane.design * (plane.cells * errors)[:, None]
     return block_sandwich(curvature, scores, parcel, plane.terms), int(parcel.max()) + 1
 
 
-def _parcel_side(plane: _Plane) -> int:
-    """Blocks to a parcel's side: two correlation lengths (to 1/e) of the departures, rounded up."""
+def _parcel_side(plane: _Plane, errors: Float64) -> int:
+    """Blocks to a parcel's side: two correlation lengths (to 1/e) of the errors, rounded up."""
     row, col = plane.lattice
     table = np.full((int(row.max()) + 1, int(col.max()) + 1), np.nan)
-    table[row, col] = plane.depart
+    table[row, col] = errors
     variance = float(np.nanmean(table**2))
     length = 1
     for lag in range(1, max(2, min(table.shape) // 3)):
@@ -354,7 +444,7 @@ def _significant(tilt: Float64, plane: _Plane) -> bool:
     """Hotelling's T² at three sigmas, since the parcels may be few."""
     from scipy.special import fdtri
 
-    covariance, parcels = _sandwich(plane)
+    covariance, parcels = _sandwich(plane, plane.depart)
     freedom = max(parcels - 3, 1)
     limit = 2 * (freedom + 1) / freedom * float(fdtri(2, freedom, 0.9973))
     squared = covariance[1:, 1:]
@@ -363,11 +453,9 @@ def _significant(tilt: Float64, plane: _Plane) -> bool:
     return bool(tilt @ np.linalg.pinv(squared, hermitian=True) @ tilt > limit)
 
 
-def _unblocked(
-    surface: _Surface, moving: SurveyRaster, horizontal: Transform, start: Heights
-) -> Heights:
+def _unblocked(pair: _Pair, horizontal: Transform, start: Heights) -> Heights:
     """Too little ground for blocks: the median, as uncertain as a single cell."""
-    difference = surface.differences(moving, start.transform(horizontal))[0]
+    difference, _ = pair.differences(start.transform(horizontal))
     spread = MAD_TO_SIGMA * float(np.median(np.abs(difference - np.median(difference))))
     covariance = np.diag([spread**2, MAX_TILT**2 / 9, MAX_TILT**2 / 9])
     return replace(

@@ -315,7 +315,7 @@ def _in_frame(
                 refined, scale = with_scale(refined, ground)
             if motion is not None:
                 refined, scale = as_delivered(refined, motion), scale * motion.scale
-            heights = fit_heights(*first["dem"], _horizontal(refined, scale))
+            heights = fit_heights(*first["dem"], _horizontal(refined, scale), refined.offset_at)
             judgement = judgement.doubted(refined.doubt).doubted(heights.doubt)
         judgement, notes = on_heading_and_scale(
             judgement, refined.yaw, scale, settings.search, turn, motion

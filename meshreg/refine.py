@@ -57,6 +57,8 @@ class Refined:
         What the user should know.
     doubt : str
         Why the answer cannot be accepted, if so.
+    offset_at : callable or None
+        Most likely offset (N, 2) [m] at places (N, 2) in the moving survey, internal warp included.
     """
 
     pivot: Float64
@@ -69,6 +71,7 @@ class Refined:
     note: str = ""
     doubt: str = ""
     scale_variance: float = 0.0
+    offset_at: Guess | None = None
 
 
 def refine(
@@ -160,7 +163,7 @@ def over_ground(tiles: TileOffsets, ground: Ground, pivot: Float64) -> tuple[Ref
         yaw, offset = 0.0, still.answer
         covariance = _block_diagonal(still.covariance, covariance[2, 2])
     used = motion.used.astype(np.float64)
-    answer = Refined(pivot, offset, yaw, covariance, tiles, weights=used)
+    answer = Refined(pivot, offset, yaw, covariance, tiles, weights=used, offset_at=motion.field)
     return _with_residuals(answer), motion.field
 
 
