@@ -139,9 +139,7 @@ def _beside(lattice: Index) -> tuple[Index, Index, Float64]:
     return start[kept], end[kept], far[kept]
 
 
-def slow_bending(
-    arm: Float64, weight: Float64, value: Float64, told: Bool
-) -> tuple[Float64, int]:
+def slow_bending(arm: Float64, weight: Float64, value: Float64, told: Bool) -> tuple[Float64, int]:
     """Slow bending of the models at all blocks [m] and its number of terms, from those `told`.
 
     A cubic in both directions, or less where blocks are few.

@@ -36,6 +36,10 @@ LEAST_RECURRING = 0.1  # share of the common cells; with less, all of them are a
 # m, sigma: how far sand may have risen or fallen where nothing tells; by then up is no better known
 # than by two depths of 5 cm each.
 SHEET = 0.07
+NO_DETAIL = (
+    "too little ground shows the same small relief in both surveys: if it rose or fell as a whole "
+    f"(sand), up is off by as much; ±{100 * SHEET:g} cm is added for that"
+)
 LEAST_STEP = 0.1  # cells: what parts two blocks that did not change alike is higher than that
 BEND_STEP = 8  # cells between the places at which the bending is computed
 OffsetAt = Callable[[Float64], Float64]
@@ -129,9 +133,9 @@ def fit_heights(
     The covariance is the block sandwich (`meshreg.sandwich`) of the blocks' departures from their
     neighbours for `up`, from a slow bending (a cubic in east and north) for the tilt, over parcels
     at least two correlation lengths of these departures wide: the slow bending itself moves the
-    best fit over all ground as much as this one. Added to the variance of `up` are the squares of how much it changes if nothing is left out (median of all
-    cells: when much has changed, what counts as stable ground is a choice), and of what the bending
-    may do where no ground counts.
+    best fit over all ground as much as this one. Added to the variance of `up` are the squares of
+    how much it changes if nothing is left out (median of all cells: when much has changed, what
+    counts as stable ground is a choice), and of what the bending may do where no ground counts.
 
     Parameters
     ----------
@@ -157,15 +161,18 @@ def fit_heights(
     start = Heights(place)
     first = pair.differences(start.transform(horizontal))[0]
     start = replace(start, up=float(np.median(first)))
-    pair, note = pair.where_detail_recurs(start.transform(horizontal))
+    everything, note = pair, ""
+    pair = everything.where_detail_recurs(start.transform(horizontal))
     free, plane = _settled(pair, horizontal, start, tilted=True)
+    loose = np.zeros((3, 3))
+    if plane is None:
+        pair, note = everything, NO_DETAIL
+        loose[0, 0] = SHEET**2
+        free, plane = _settled(pair, horizontal, start, tilted=True)
     if plane is None:
         return _unblocked(pair, horizontal, start)
     tilt = float(np.hypot(*free.tilt))
     significant = _significant(free.tilt, plane)
-    loose = np.zeros((3, 3))
-    if note:
-        loose[0, 0] = SHEET**2
     if significant and tilt > MAX_TILT:
         degrees = np.rad2deg(tilt)
         doubt = f"the surveys are tilted against each other by {degrees:.1f}°, beyond 3°"
@@ -243,20 +250,15 @@ class _Pair:
         height = map_coordinates(self.spline, at, order=3, prefilter=False, mode="mirror")
         return height + self.base - points[:, 2], points
 
-    def where_detail_recurs(self, transform: Transform) -> tuple[_Pair, str]:
-        """Return the pair that counts only recurring ground; all, and why, where there is little."""
+    def where_detail_recurs(self, transform: Transform) -> _Pair:
+        """Return the pair that counts only recurring ground; none of it, where there is little."""
         difference, points = self.differences(transform)
         known = np.zeros(self.moving.grid.shape, bool)
         known[self.row, self.col] = True
         heights = np.zeros((2, *known.shape))
         heights[:, self.row, self.col] = points[:, 2] + difference, points[:, 2]
         counts = recurring(*heights, known)[self.row, self.col]
-        if counts.mean() < LEAST_RECURRING:
-            return self, (
-                "no ground shows the same small relief in both surveys: if it rose or fell as a "
-                f"whole (sand), up is off by as much; ±{100 * SHEET:g} cm is added for that"
-            )
-        return replace(self, counts=counts), ""
+        return replace(self, counts=counts & (counts.mean() >= LEAST_RECURRING))
 
 
 def _bend(moving: SurveyRaster, horizontal: Transform, offset_at: OffsetAt | None) -> Float64:

@@ -25,12 +25,13 @@ MIN_TILES = 6
 LEAST_FOR_SCALE = 12  # tiles, for a scale of their own
 UNKNOWN_SCALE = 0.01 / 3  # sigma: beyond 1 % a scale is plainly wrong, and found before (`voting`)
 NODES = 20  # along the overlap's side
-# Of the variance: internal warps are neither Gaussian nor alike everywhere, as kriging takes them
-# to be. Measured (`meshreg benchmark`, coverage of the stated region), not derived.
-MISFIT = 3.0
+# Cells along a tile's side from which its scatter tells all of its error: kriging takes the warp to
+# be smooth and the tiles to err independently, and small tiles, of few details each, do so less.
+# Measured on synthetic pairs of 8 to 25 m (coverage of the stated region), not derived.
+HONEST_SIDE = 48
 # Cells: what sampling alone leaves open, alike for all tiles, so that their scatter does not show
 # it; for peaks of correlation (a parabola through whole cells leans towards them), and polished.
-PEAK_RESOLUTION, RESOLUTION = 0.05, 0.01
+PEAK_RESOLUTION, RESOLUTION = 0.05, 0.005
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +104,10 @@ def refine(
     rough = fit(tiles, centre)
     assert rough.weights is not None
     kept = tiles.only(rough.weights > 0)
-    best = over_ground(kept, ground, centre)[0] if _enough(kept) else rough
+    if _enough(kept):
+        best = over_ground(kept, ground, centre)[0]
+    else:
+        best = replace(rough, covariance=misfit(tiles) * rough.covariance)
     cells = [moving.grid.cell for _, moving, _ in rasters]
     best = _stated(best, PEAK_RESOLUTION * max(cells))
     for reference, moving, channel in rasters:
@@ -124,7 +128,12 @@ def refine(
 def _stated(refined: Refined, resolution: float) -> Refined:
     """Add to the covariance what the scatter of tiles does not show; `resolution` is in metres."""
     floor = np.diag([resolution**2, resolution**2, 0.0])
-    return replace(refined, covariance=MISFIT * refined.covariance + floor)
+    return replace(refined, covariance=refined.covariance + floor)
+
+
+def misfit(tiles: TileOffsets) -> float:
+    """By how much the variance is larger than the tiles' scatter tells."""
+    return max(1.0, HONEST_SIDE / tiles.side)
 
 
 def _polished(
@@ -148,20 +157,25 @@ def _polished(
 def over_ground(tiles: TileOffsets, ground: Ground, pivot: Float64) -> tuple[Refined, Field]:
     """Rigid motion that fits the whole ground best; the yaw is 0 where it is under two sigmas.
 
-    The ground counts as the reference sees it: where the models stretch, so do its cells. Also
-    returned is the most likely offset at any place, internal warp included.
+    The ground counts as the reference sees it: where the models stretch, so do its cells. It might
+    as well count as the moving survey sees it, which is what the same pair the other way round will
+    do: half of what that changes is added to the doubt. Also returned is the most likely offset at
+    any place, internal warp included.
     """
     places, offsets = tiles.places, tiles.offsets
     motion = best_motion(places, offsets, ground, pivot, yaw_free=True)
+    either = motion.answer
     share = ground.share * np.clip(motion.field.growth(ground.places), 0.5, 2.0)
     ground = replace(ground, share=share / share.sum())
     motion = best_motion(places, offsets, ground, pivot, yaw_free=True, start=motion)
+    half = 0.5 * (motion.answer - either)
     covariance, yaw = motion.covariance, float(motion.answer[2])
     offset = motion.answer[:2]
     if abs(yaw) <= 2 * np.sqrt(covariance[2, 2]):
         still = best_motion(places, offsets, ground, pivot, yaw_free=False, start=motion)
         yaw, offset = 0.0, still.answer
         covariance = _block_diagonal(still.covariance, covariance[2, 2])
+    covariance = misfit(tiles) * covariance + np.outer(half, half)
     used = motion.used.astype(np.float64)
     answer = Refined(pivot, offset, yaw, covariance, tiles, weights=used, offset_at=motion.field)
     return _with_residuals(answer), motion.field
@@ -182,7 +196,7 @@ def with_scale(refined: Refined, ground: Ground) -> tuple[Refined, float]:
     similar = motion.answer[2:] + np.array([0.0, 1.0])  # s sin psi, s cos psi
     scale = float(np.hypot(*similar))
     slope = similar / scale
-    variance = MISFIT * float(slope @ motion.covariance[2:, 2:] @ slope)
+    variance = misfit(tiles) * float(slope @ motion.covariance[2:, 2:] @ slope)
     return replace(refined, scale_variance=variance / scale**2), scale
 
 
@@ -280,6 +294,7 @@ def _joined(found: Sequence[TileOffsets | None]) -> TileOffsets | None:
         np.concatenate([p.offsets for p in parts]),
         bins[:, 0] * n_side + bins[:, 1],
         np.concatenate([p.channel for p in parts]),
+        min(p.side for p in parts),
     )
 
 

@@ -41,17 +41,20 @@ class TileOffsets:
         Tiles at the same place share a block, whichever channel saw them.
     channel : (M,) int
         Which of the channels matched it.
+    side : int
+        Cells along a tile's side.
     """
 
     places: Float64
     offsets: Float64
     block: np.ndarray
     channel: np.ndarray
+    side: int = TILE_CELLS
 
     def only(self, keep: Bool) -> TileOffsets:
         """Return the tiles where `keep` (M,) is True."""
         several = (self.places, self.offsets, self.block, self.channel)
-        return TileOffsets(*(value[keep] for value in several))
+        return TileOffsets(*(value[keep] for value in several), self.side)
 
 
 @dataclass(frozen=True)
@@ -118,7 +121,7 @@ def correlated_tiles(
         if step is not None:
             middle = moving.grid.east_north(top + 0.5 * (side - 1), left + 0.5 * (side - 1))
             found.append((*middle, overlap.offset[0] + step[0], overlap.offset[1] + step[1]))
-    return _as_tiles(found, int(channel == "image"))
+    return _as_tiles(found, int(channel == "image"), side)
 
 
 def _correlate_tile(
@@ -208,7 +211,7 @@ def polished_tiles(
     places = np.stack(moving.grid.east_north(*middle), axis=1)
     number = len(places)
     offsets = bend.at(middle) + added[found]
-    return TileOffsets(places, offsets, np.arange(number), np.zeros(number, int))
+    return TileOffsets(places, offsets, np.arange(number), np.zeros(number, int), side)
 
 
 def _known_cells(
@@ -288,9 +291,10 @@ class Relief:
         )
 
 
-def _as_tiles(found: list[tuple[Any, ...]], channel: int) -> TileOffsets | None:
+def _as_tiles(found: list[tuple[Any, ...]], channel: int, side: int) -> TileOffsets | None:
     if not found:
         return None
     rows = np.array(found, float)
     number = len(rows)
-    return TileOffsets(rows[:, :2], rows[:, 2:], np.arange(number), np.full(number, channel))
+    channels = np.full(number, channel)
+    return TileOffsets(rows[:, :2], rows[:, 2:], np.arange(number), channels, side)

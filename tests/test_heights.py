@@ -216,9 +216,7 @@ def test_sand_that_rose_as_a_sheet_does_not_lift_the_survey(rise):
 
 def test_ground_without_detail_is_not_believed_to_have_stayed():
     """Bare sand: what it rose by cannot be told from an error in depth."""
-    bare = [
-        dataclasses.replace(relief(), height=waves(relief(), k, 0.35, 0.008)) for k in (1, 2)
-    ]
+    bare = [dataclasses.replace(relief(), height=waves(relief(), k, 0.35, 0.008)) for k in (1, 2)]
     found = fit_heights(bare[0], lowered(bare[1], 0.05), HERE)
     assert found.up == pytest.approx(0.05, abs=0.005)
     assert np.sqrt(found.covariance[0, 0]) >= SHEET

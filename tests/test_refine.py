@@ -11,7 +11,7 @@ import pytest
 import seafloor
 
 from meshreg.kriging import Ground
-from meshreg.refine import MISFIT, Refined, fit, refine, with_scale
+from meshreg.refine import Refined, fit, misfit, refine, with_scale
 from meshreg.tiles import TileOffsets
 from meshreg.types import Grid, SurveyRaster
 
@@ -162,7 +162,7 @@ def tiles_of_a_similarity(seed, scale, yaw, warp, noise=0.003):
     ("scale", "yaw", "warp"), [(0.97, 0.012, 0.0), (1.02, -0.015, 0.0), (1.02, 0.0, 0.02)]
 )
 def test_scale_and_its_variance(scale, yaw, warp):
-    """Over many draws the scale scatters about the truth by what is stated, `MISFIT` apart.
+    """Over many draws the scale scatters about the truth by what is stated, `misfit` apart.
 
     Waves are smoother than the random field that the warp is taken for: there it says too much.
     """
@@ -176,7 +176,7 @@ def test_scale_and_its_variance(scale, yaw, warp):
         variance.append(answer.scale_variance)
     error, variance = np.array(error), np.array(variance)
     assert np.abs(error).max() < (0.0004 if warp == 0 else 0.002)
-    ratio = variance.mean() / (error**2).mean() / MISFIT
+    ratio = variance.mean() / (error**2).mean() / misfit(refined.tiles)
     assert 0.6 < ratio < (1.9 if warp == 0 else 10.0)
     assert (error**2 < 9 * variance).all()
 
