@@ -229,7 +229,7 @@ class _Pair:
         bend = _bend(moving, horizontal, offset_at)[row, col]
         there = horizontal.apply(_points(moving, row, col))[:, :2] + bend
         at = np.rint(np.stack(reference.grid.row_col(*there.T))).astype(int)
-        inside = ((at >= 0) & (at < np.array(inner.shape)[:, None])).all(axis=0)
+        inside = np.all((at >= 0) & (at < np.array(inner.shape)[:, None]), axis=0)
         inside[inside] = inner[tuple(at[:, inside])]
         spline, row, col = spline_filter(height - base, 3), row[inside], col[inside]
         base, everything = base + reference.datum, np.ones(len(row), bool)
@@ -257,7 +257,7 @@ class _Pair:
         known[self.row, self.col] = True
         heights = np.zeros((2, *known.shape))
         heights[:, self.row, self.col] = points[:, 2] + difference, points[:, 2]
-        counts = recurring(*heights, known)[self.row, self.col]
+        counts = recurring(heights[0], heights[1], known)[self.row, self.col]
         return replace(self, counts=counts & (counts.mean() >= LEAST_RECURRING))
 
 

@@ -62,7 +62,7 @@ def overlap_ground(
     row, col = (index * step for index in np.nonzero(masks[1][::step, ::step]))
     east, north = grids[1].east_north(row, col)
     there = np.rint(np.stack(grids[0].row_col(east + offset[0], north + offset[1]))).astype(int)
-    inside = ((there >= 0) & (there < np.array(masks[0].shape)[:, None])).all(axis=0)
+    inside = np.all((there >= 0) & (there < np.array(masks[0].shape)[:, None]), axis=0)
     inside[inside] = masks[0][tuple(there[:, inside])]
     if not inside.any():
         return None

@@ -53,8 +53,8 @@ class TileOffsets:
 
     def only(self, keep: Bool) -> TileOffsets:
         """Return the tiles where `keep` (M,) is True."""
-        several = (self.places, self.offsets, self.block, self.channel)
-        return TileOffsets(*(value[keep] for value in several), self.side)
+        block, channel = self.block[keep], self.channel[keep]
+        return TileOffsets(self.places[keep], self.offsets[keep], block, channel, self.side)
 
 
 @dataclass(frozen=True)
