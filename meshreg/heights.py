@@ -100,7 +100,10 @@ class Heights:
             return self
         degrees = np.rad2deg(np.hypot(*self.tilt))
         note = f"tilted by {degrees:.2f}° against the reference, which maps cannot undo"
-        return replace(self, tilt=np.zeros(2), note=note)
+        covariance = self.covariance.copy()
+        covariance[1:, 1:] += np.outer(self.tilt, self.tilt)
+        note = "; ".join(filter(None, (note, self.note)))
+        return replace(self, tilt=np.zeros(2), covariance=covariance, note=note)
 
 
 def rotation(tilt: Float64) -> Float64:

@@ -15,17 +15,11 @@ from typing import Any
 
 import numpy as np
 
+from meshreg.decision import Decision, completed, decide
 from meshreg.errors import UsageError
-from meshreg.heading import turning
-from meshreg.pipeline import (
-    Decision,
-    Pairs,
-    completed,
-    decide,
-    prepared,
-    rasterize_pair,
-    surveys_apart,
-)
+from meshreg.heading import Pairs, turning
+from meshreg.levels import rasterize_pair
+from meshreg.pipeline import prepared, surveys_apart
 from meshreg.settings import Settings
 from meshreg.types import Float64, Survey, Transform, Verdict
 from meshreg.voting import Turn

@@ -41,9 +41,11 @@ RULES: dict[str, set[str]] = {
     "offsets": BASE | {"jit", "kriging", "raster", "sandwich"},
     "calibration": set(),
     "judge": BASE | {"raster", "offsets"},
+    "levels": BASE | {"offsets", "raster", "statistics"},
+    "decision": BASE | {"heading", "heights", "judge", "offsets", "refine", "statistics", "voting"},
     "pipeline": BASE
-    | {"raster", "offsets", "judge", "refine", "heights", "surfaces", "warp", "apply", "statistics"}
-    | {"voting", "heading", "warp_rasters", "calibration"},
+    | {"calibration", "decision", "heading", "heights", "judge", "levels", "offsets", "raster"}
+    | {"refine", "statistics", "surfaces", "voting", "warp", "warp_rasters"},
     "ties": BASE | {"io", "raster", "offsets", "statistics", "report"},
     "doctor": set(),
 }

@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from meshreg import pipeline
 from meshreg.benchmark.hand import Hand
 from meshreg.benchmark.rasters import turned
+from meshreg.decision import Decision, decide
 from meshreg.offsets import search_radius
 from meshreg.refine import Refined
 from meshreg.settings import Settings
@@ -54,7 +54,7 @@ def register_rasters(
     pairs: Mapping[str, tuple[SurveyRaster, SurveyRaster]],
     settings: Settings,
     radius: float | None = None,
-) -> pipeline.Decision:
+) -> Decision:
     """Decide on a pair of rasters exactly as `meshreg.register_pair` does on its own.
 
     Parameters
@@ -69,11 +69,11 @@ def register_rasters(
     radius = search_radius(settings, cell) if radius is None else radius
     settings = settings.changed({"search.radius": radius})
     again = partial(turned, dict(pairs))
-    return pipeline.decide(dict(pairs), settings, radius, turned=again)
+    return decide(dict(pairs), settings, radius, turned=again)
 
 
 def of_decision(
-    decision: pipeline.Decision, preset: str, truth: Mapping[str, Any], hand: Hand | None
+    decision: Decision, preset: str, truth: Mapping[str, Any], hand: Hand | None
 ) -> list[Row]:
     """Return a row for each method and one for the fused answer."""
     judgement, refined = decision.judgement, decision.refined

@@ -17,7 +17,7 @@ from meshreg.cli_parts.console import Voice
 from meshreg.errors import InputError, UsageError
 
 if TYPE_CHECKING:
-    from meshreg.pipeline import Manual
+    from meshreg.decision import Manual
     from meshreg.settings import Settings
     from meshreg.ties.foreign import Context, ToMetres
     from meshreg.ties.placing import Placing

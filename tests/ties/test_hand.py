@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_registration import EAST, NORTH, made_registration
 
-from meshreg import cli, pipeline
+from meshreg import cli, decision
 from meshreg.errors import InputError
 from meshreg.io import document as document_module
 from meshreg.io.document import read_registration, registration_document, to_json
@@ -288,7 +288,7 @@ TRUE = (1.237, -2.412)
 def decided(rasters, offset, count=25):
     reference, moving = clicked(4, count, offset=np.array(offset))
     ties = picked(reference, moving)
-    return pipeline.decide(
+    return decision.decide(
         rasters,
         SETTINGS,
         SETTINGS.search.radius,
@@ -302,7 +302,7 @@ def rasters():
 
 
 def test_ties_are_one_more_method_marked_as_manual(rasters):
-    without = pipeline.decide(rasters, SETTINGS, SETTINGS.search.radius)
+    without = decision.decide(rasters, SETTINGS, SETTINGS.search.radius)
     right = decided(rasters, TRUE)
     assert right.judgement.verdict == without.judgement.verdict == "accepted"
     assert "ties" in right.judgement.best.methods
