@@ -365,6 +365,8 @@ def test_a_site_in_full_gives_table_one_and_its_figures(
     fused = next(r for r in rows if r["method"] == "fused" and r["preset"] == "robust")
     assert fused["error"] < 0.1
     assert abs(fused["error_up"]) < 0.05
+    assert fused["covered_up"] == (abs(fused["error_up"]) <= 1.959964 * fused["sigma_up"])
+    assert summary["coverage"]["crossing"]["up"]["total"] == 0  # "table" pairs stand beside these
     (tmp_path / "figures" / record["figures"][0]).unlink()
     assert running.read_record(job, tmp_path) is None  # a figure is gone: made again
 

@@ -27,6 +27,7 @@ from meshreg.types import (
 
 SUCCESS = 0.25  # m: a larger error is a failure
 LEVEL_95 = -2.0 * math.log(0.05)  # chi-square, 2 degrees of freedom
+NORMAL_95 = 1.959964  # of one axis, in deviations
 Row = dict[str, Any]
 
 
@@ -84,7 +85,8 @@ def of_decision(
     best = judgement.best
     gaps = {} if best is None else dict(best.gaps)
     fused = _fused_row(answer, verdict, gaps, decision.seconds)
-    fused |= _error_up(decision.transform, truth)
+    variance = 0.0 if decision.heights is None else float(decision.heights.covariance[0, 0])
+    fused |= _error_up(decision.transform, truth, math.sqrt(variance))
     rows = [_method_row(e) for e in decision.estimates]
     return _finished(rows, fused, answer, preset, truth, hand)
 
@@ -105,17 +107,21 @@ def of_registration(
     first = registration.hypotheses[0] if registration.hypotheses else {}
     gaps = {c: first[f"{c}_gap"] for c in first.get("channels", ())}
     fused = _fused_row(answer, verdict, gaps, registration.seconds)
-    fused |= _error_up(transform, truth)
+    stated = registration.registration_error or {}
+    fused |= _error_up(transform, truth, stated.get("z", 0.0))
     rows = [_method_row(e) for e in registration.estimates]
     return _finished(rows, fused, answer, preset, truth, hand)
 
 
-def _error_up(transform: Transform | None, truth: Mapping[str, Any]) -> Row:
+def _error_up(transform: Transform | None, truth: Mapping[str, Any], sigma: float) -> Row:
+    """Error [m] in height at the centroid, and whether the stated 95 % hold the truth."""
     if transform is None or truth.get("centroid") is None:
         return {}
     centroid = np.array(truth["centroid"])
-    there = transform.apply(centroid)[2] - centroid[2]
-    return {"error_up": float(there - truth["offset"][2])}
+    error = float(transform.apply(centroid)[2] - centroid[2] - truth["offset"][2])
+    if sigma <= 0:
+        return {"error_up": error}
+    return {"error_up": error, "sigma_up": sigma, "covered_up": abs(error) <= NORMAL_95 * sigma}
 
 
 @dataclass(frozen=True)

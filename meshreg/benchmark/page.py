@@ -276,9 +276,9 @@ def _trust(summary: Mapping[str, Any]) -> str:
         ],
     )
     covered = _table(
-        ("stated 95 % region covers the truth", *(_method(m) for m in tables.ANSWERS)),
+        ("stated 95 % region covers the truth", *(_method(m) for m in tables.ANSWERS), "height"),
         [
-            (where.replace("_", " "), *(_rate(found[m]) for m in tables.ANSWERS))
+            (where.replace("_", " "), *(_rate(found[m]) for m in (*tables.ANSWERS, "up")))
             for where, found in summary["coverage"].items()
         ],
     )

@@ -19,7 +19,7 @@ from meshreg import __version__
 from meshreg.errors import UsageError
 from meshreg.settings import Settings
 
-SCHEMA = 1  # of the files of a run; raised whenever the same job would give another record
+SCHEMA = 2  # of the files of a run; raised whenever the same job would give another record
 DEM_CELL, ORTHO_CELL, SIFT_CELL = 0.10, 0.05, 0.025  # m
 PAPER_SITES = ("tasmania_12h", "abrolhos_12mo", "scott_24mo")
 INTERVALS = dict(zip(("12h", "12mo", "24mo"), PAPER_SITES, strict=True))

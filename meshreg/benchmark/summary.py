@@ -47,6 +47,7 @@ def summarise(records: Sequence[Record]) -> tuple[dict[str, Any], list[dict[str,
                 method: tables.coverage(tables.select(some, method=method))
                 for method in tables.ANSWERS
             }
+            | {"up": tables.coverage(tables.select(some, method="fused"), "covered_up")}
             for name, some in (("crossing", crossing), ("not_flat", tables.not_flat(robust)))
         },
         "errors": {

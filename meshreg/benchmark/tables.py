@@ -17,9 +17,9 @@ Row = Mapping[str, Any]
 COLUMNS = (
     "kind", "scenario", "ground", "interval", "severity", "index", "seed", "format", "preset",
     "method", "status", "east", "north", "true_east", "true_north", "yaw", "error", "error_hand",
-    "error_up", "success", "covered", "sigma", "distance2", "gap", "terrain_gap", "image_gap",
-    "score", "matches", "inliers", "inlier_share", "seconds", "verdict", "false_alarm", "expected",
-    "overlap", "warp_residual", "hand_residual", "reason", "places",
+    "error_up", "sigma_up", "covered_up", "success", "covered", "sigma", "distance2", "gap",
+    "terrain_gap", "image_gap", "score", "matches", "inliers", "inlier_share", "seconds", "verdict",
+    "false_alarm", "expected", "overlap", "warp_residual", "hand_residual", "reason", "places",
 )  # fmt: skip
 ANSWERS = (*METHODS, "fused")
 
@@ -141,9 +141,9 @@ def verdicts(rows: Sequence[Row]) -> dict[str, dict[str, Any]]:
     return result
 
 
-def coverage(rows: Iterable[Row]) -> dict[str, Any]:
-    """Return how often the stated 95 % region covers the truth."""
-    return rate(row["covered"] for row in rows if row.get("covered") is not None)
+def coverage(rows: Iterable[Row], column: str = "covered") -> dict[str, Any]:
+    """Return how often the stated 95 % region covers the truth ("covered_up": in height)."""
+    return rate(row[column] for row in rows if row.get(column) is not None)
 
 
 def error_summary(rows: Sequence[Row], column: str = "error") -> dict[str, Any]:
