@@ -223,13 +223,16 @@ def completed(
     if refined is None or heights is None or transform is None:
         return None, None, None
     transform = transform.at(moving.centre)
-    covariance = _covariance(refined, heights, transform)
+    covariance = covariance_of(decision, transform)
     place = transform.apply(heights.place)
     return transform, covariance, statistics.registration_error(covariance, transform, place)
 
 
-def _covariance(refined: Refined, heights: Heights, transform: Transform) -> Float64:
+def covariance_of(decision: Decision, transform: Transform) -> Float64:
     """(7, 7) at the transform's pivot: the doubt of yaw and tilt grows with the lever."""
+    refined, heights = decision.refined, decision.heights
+    assert refined is not None
+    assert heights is not None
     start = np.append(refined.pivot, heights.place[2])
     covariance = np.zeros((7, 7))
     known = [0, 1, 5]

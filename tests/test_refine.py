@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 import seafloor
 
+from meshreg.heading import as_delivered
 from meshreg.kriging import Ground
-from meshreg.refine import Refined, fit, misfit, refine, with_scale
+from meshreg.refine import Refined, fit, misfit, over_ground, refine, with_scale
 from meshreg.tiles import TileOffsets
-from meshreg.types import Grid, SurveyRaster
+from meshreg.types import Grid, SurveyRaster, Transform
 
 OFFSET = (1.237, -2.412)
 REEF = Path(__file__).parent / "data" / "reef_dem" / "horseshoe_dem.tif"
@@ -195,3 +196,90 @@ def test_too_few_tiles_keep_the_judged_offset():
     np.testing.assert_array_equal(result.offset, [0.1, 0.0])
     assert result.yaw == 0.0
     assert "too few tiles" in result.note
+
+
+def uniform_ground(inside, spacing=0.05, node=1.0):
+    """Places that stand for all that `inside` (N, 2) -> (N,) bool holds to be seen by both."""
+    axis = np.arange(-12.0, 12.0, spacing) + 0.5 * spacing
+    places = np.stack([a.ravel() for a in np.meshgrid(axis, axis)], axis=1)
+    places = places[inside(places)]
+    _, number = np.unique(np.floor(places / node), axis=0, return_inverse=True)
+    count = np.bincount(number.ravel())
+    means = [np.bincount(number.ravel(), column) / count for column in places.T]
+    return Ground(np.stack(means, axis=1), count / count.sum())
+
+
+def bent(seed, size):
+    """A warp with waves of 10 to 20 m that stretches by some per cent, and its inverse."""
+    rng = np.random.default_rng(seed)
+    waves = [
+        (2 * np.pi / rng.uniform(10, 20) * np.array([np.cos(a), np.sin(a)]), p, rng.normal(0, 1, 2))
+        for a, p in rng.uniform(0, 2 * np.pi, (5, 2))
+    ]
+
+    def there(places):
+        return (0.7, -0.4) + size / np.sqrt(2.5) * sum(
+            length * np.sin(places @ k + phase)[:, None] for k, phase, length in waves
+        )
+
+    def back(places):
+        start = places.copy()
+        for _ in range(30):
+            start = places - there(start)
+        return start - places
+
+    return there, back, rng
+
+
+@pytest.mark.parametrize("size", [0.03, 0.15])
+def test_there_and_back_is_nothing_within_three_sigmas(size):
+    """Each direction counts the ground as its own reference sees it, and says what it is worth."""
+    largest = []
+    for seed in range(12):
+        there, back, rng = bent(seed, size)
+        axis = np.linspace(-8, 8, 8)
+        tiles = np.stack([a.ravel() for a in np.meshgrid(axis, axis)], axis=1)
+        answers = []
+        for offset in (there, back):
+            noise = rng.normal(0, 0.001, tiles.shape)
+            found = TileOffsets(tiles, offset(tiles) + noise, np.arange(64), np.zeros(64, int))
+
+            def seen(places, offset=offset):
+                return np.abs(places + offset(places)).max(axis=1) < 9
+
+            ground = uniform_ground(lambda p, seen=seen: (np.abs(p).max(axis=1) < 9) & seen(p))
+            answers.append(over_ground(found, ground, ground.share @ ground.places)[0])
+        first, second = answers
+        home = first.pivot + first.offset
+        arm = home - second.pivot
+        returned = home + second.offset + second.yaw * np.array([-arm[1], arm[0]])
+        lever = np.array([[1, 0, -arm[1]], [0, 1, arm[0]], [0, 0, 1]])
+        covariance = first.covariance + lever @ second.covariance @ lever.T
+        miss = np.append(returned - first.pivot, first.yaw + second.yaw)
+        largest.append(np.abs(miss / np.sqrt(np.diag(covariance))).max())
+    assert np.mean(np.array(largest) < 3) > 0.9
+    assert max(largest) < 3.6
+    assert np.median(largest) > 0.2
+
+
+def test_small_tiles_are_trusted_less():
+    tiles = TileOffsets(np.zeros((1, 2)), np.zeros((1, 2)), np.zeros(1, int), np.zeros(1, int))
+    sides = [16, 24, 48, 100]
+    found = [misfit(dataclasses.replace(tiles, side=side)) for side in sides]
+    assert found == sorted(found, reverse=True)
+    assert found[0] == pytest.approx(3.0)
+    assert found[2:] == [1.0, 1.0]
+
+
+def test_where_ground_goes_is_told_from_the_survey_as_delivered():
+    """Turned first: place, turn and answer together lead where the turned survey's answer does."""
+    floor = refined(3, 0.0, 0.0)
+    yaw, centre = np.deg2rad(5.0), np.array([3.0, -1.0, 0.0])
+    c, s = np.cos(yaw), np.sin(yaw)
+    motion = Transform([[c, -s, 0], [s, c, 0], [0, 0, 1]], 1.0, np.zeros(3), centre)
+    whole = as_delivered(floor, motion)
+    places = np.random.default_rng(1).uniform(-5, 5, (20, 2))
+    turned = motion.apply(np.column_stack([places, np.zeros(20)]))[:, :2]
+    np.testing.assert_allclose(
+        places + whole.offset_at(places), turned + floor.offset_at(turned), atol=1e-12
+    )

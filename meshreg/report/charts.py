@@ -235,7 +235,7 @@ def stable(picture: Any, about: Mapping[str, Any], bounds: Sequence[float], reli
     )
     names = (
         ("stable", "stable, used for height and tilt"),
-        ("changed", "changed against the ground around it"),
+        ("changed", "changed, or without detail that recurs"),
         ("set_aside", "changed as a whole block, told by its neighbours"),
     )
     legend = "".join(

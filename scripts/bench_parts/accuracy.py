@@ -6,6 +6,9 @@ and light as in the recipe `severity`. DEM cells of 0.10 m, orthomosaic 0.05 m.
 Where the models bend, `--warp auto` is measured too: what is left between where it puts each place
 of the overlap, on a lattice of 0.25 m, and where that belongs. All of the overlap counts, changed
 ground included, since the truth is where the rock went and not what grew on it.
+
+Each pair is registered the other way round too: there and back should be nothing, within three
+sigmas of east, north, up, both tilts and yaw.
 """
 
 from __future__ import annotations
@@ -46,6 +49,7 @@ def one(case: str, changes: dict[str, Any], seed: int) -> dict[str, Any]:
     }
     settings = Settings().changed({"methods": ("terrain", "mutual_information")})
     decision = register_rasters(pairs, settings)
+    back = register_rasters({name: (b, a) for name, (a, b) in pairs.items()}, settings)
     rows = of_decision(decision, "robust", made.truth, None)
     fused = next(row for row in rows if row["method"] == "fused")
     turn = float("nan") if decision.refined is None else decision.refined.yaw - made.truth["yaw"]
@@ -55,10 +59,33 @@ def one(case: str, changes: dict[str, Any], seed: int) -> dict[str, Any]:
         "covered": fused.get("covered", False),
         "yaw": abs(np.rad2deg(turn)),
         "verdict": fused["verdict"],
+        "error up": fused.get("error_up", float("nan")),
+        "covered up": fused.get("covered_up", False),
+        "back": there_and_back(decision, back),
         "warped": warped(decision, pairs["dem"], common_points(made.scene, 0.25))
         if changes["sfm.warp"]
         else None,
     }
+
+
+def there_and_back(there: Any, back: Any) -> float:
+    """Largest deviation of the six parameters from nothing, in sigmas of both answers together."""
+    from meshreg import statistics
+    from meshreg.decision import covariance_of
+
+    if there.transform is None or back.transform is None:
+        return float("nan")
+    place = there.heights.place
+    home = there.transform.apply(place)
+    covariance = np.zeros((7, 7))
+    for answer, at in ((there, place), (back, home)):
+        transform = answer.transform
+        lever = statistics.lever(transform.apply(at) - (transform.pivot + transform.offset))
+        covariance += lever @ covariance_of(answer, transform) @ lever.T
+    turn = back.transform.rotation @ there.transform.rotation
+    axes = [turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]
+    miss = np.append(back.transform.apply(home) - place, 0.5 * np.array(axes))
+    return float(np.abs(miss / np.sqrt(np.diag(covariance)[:6])).max())
 
 
 def warped(
@@ -127,6 +154,9 @@ def bench() -> list[dict[str, Any]]:
                 "yaw median °": float(np.nanmedian([d["yaw"] for d in done])),
                 "accepted": sum(d["verdict"] == "accepted" for d in done),
                 "95 % region covers": sum(bool(d["covered"]) for d in done),
+                "up median mm": float(1e3 * np.nanmedian(np.abs([d["error up"] for d in done]))),
+                "up covers": sum(bool(d["covered up"]) for d in done),
+                "there and back, sigmas": float(np.nanmax([d["back"] for d in done])),
             }
         )
         rows[-1] |= residuals([d["warped"] for d in done if d["warped"]])
