@@ -198,7 +198,7 @@ def test_too_few_tiles_keep_the_judged_offset():
     assert "too few tiles" in result.note
 
 
-def uniform_ground(inside, spacing=0.05, node=1.5):
+def uniform_ground(inside, spacing=0.1, node=1.5):
     """Places that stand for all that `inside` (N, 2) -> (N,) bool holds to be seen by both."""
     axis = np.arange(-12.0, 12.0, spacing) + 0.5 * spacing
     places = np.stack([a.ravel() for a in np.meshgrid(axis, axis)], axis=1)
@@ -224,7 +224,7 @@ def bent(seed, size):
 
     def back(places):
         start = places.copy()
-        for _ in range(30):
+        for _ in range(15):
             start = places - there(start)
         return start - places
 
