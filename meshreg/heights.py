@@ -43,8 +43,8 @@ NO_DETAIL = (
 LEAST_STEP = 0.1  # cells: what parts two blocks that did not change alike is higher than that
 BEND_STEP = 8  # cells between the places at which the bending is computed
 OffsetAt = Callable[[Float64], Float64]
-# What a cell of ground was for the height and the tilt: not compared; changed, or without detail that
-# recurs; in a block that changed as a whole, which is told by its neighbours; counted.
+# What a cell of ground was for the height and the tilt: not compared; changed, or without detail
+# that recurs; in a block that changed as a whole, which is told by its neighbours; counted.
 UNKNOWN, CHANGED, SET_ASIDE, STABLE = range(4)
 
 
