@@ -25,10 +25,10 @@ MIN_TILES = 6
 LEAST_FOR_SCALE = 12  # tiles, for a scale of their own
 UNKNOWN_SCALE = 0.01 / 3  # sigma: beyond 1 % a scale is plainly wrong, and found before (`voting`)
 NODES = 20  # along the overlap's side
-# Cells along a tile's side from which its scatter tells all of its error: kriging takes the warp to
-# be smooth and the tiles to err independently, and small tiles, of few details each, do so less.
-# Measured on synthetic pairs of 8 to 25 m (coverage of the stated region), not derived.
-HONEST_SIDE = 48
+# Kriging takes the warp to be smooth and the tiles to err independently; small tiles, of few details
+# each, do so less. The variance is larger by the root of HONEST_SIDE over the cells along a tile's
+# side. Measured on synthetic pairs of 12 to 25 m (coverage of the stated region), not derived.
+HONEST_SIDE = 100
 # Cells: what sampling alone leaves open, alike for all tiles, so that their scatter does not show
 # it; for peaks of correlation (a parabola through whole cells leans towards them), and polished.
 PEAK_RESOLUTION, RESOLUTION = 0.05, 0.005
@@ -133,7 +133,7 @@ def _stated(refined: Refined, resolution: float) -> Refined:
 
 def misfit(tiles: TileOffsets) -> float:
     """By how much the variance is larger than the tiles' scatter tells."""
-    return max(1.0, HONEST_SIDE / tiles.side)
+    return max(1.0, float(np.sqrt(HONEST_SIDE / tiles.side)))
 
 
 def _polished(

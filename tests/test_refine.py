@@ -264,11 +264,11 @@ def test_there_and_back_is_nothing_within_three_sigmas(size):
 
 def test_small_tiles_are_trusted_less():
     tiles = TileOffsets(np.zeros((1, 2)), np.zeros((1, 2)), np.zeros(1, int), np.zeros(1, int))
-    sides = [16, 24, 48, 100]
+    sides = [16, 24, 36, 100, 128]
     found = [misfit(dataclasses.replace(tiles, side=side)) for side in sides]
     assert found == sorted(found, reverse=True)
-    assert found[0] == pytest.approx(3.0)
-    assert found[2:] == [1.0, 1.0]
+    assert found[0] == pytest.approx(2.5)
+    assert found[3:] == [1.0, 1.0]
 
 
 def test_where_ground_goes_is_told_from_the_survey_as_delivered():
