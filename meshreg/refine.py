@@ -25,9 +25,9 @@ MIN_TILES = 6
 LEAST_FOR_SCALE = 12  # tiles, for a scale of their own
 UNKNOWN_SCALE = 0.01 / 3  # sigma: beyond 1 % a scale is plainly wrong, and found before (`voting`)
 NODES = 20  # along the overlap's side
-# Kriging takes the warp to be smooth and the tiles to err independently; small tiles, of few details
-# each, do so less. The variance is larger by the root of HONEST_SIDE over the cells along a tile's
-# side. Measured on synthetic pairs of 12 to 25 m (coverage of the stated region), not derived.
+# Kriging takes the warp to be smooth and the tiles to err independently; small tiles, with few
+# details each, do so less. The variance is larger by the root of HONEST_SIDE over the cells along
+# a tile's side. Measured on synthetic pairs of 12 to 25 m (coverage of the stated region).
 HONEST_SIDE = 100
 # Cells: what sampling alone leaves open, alike for all tiles, so that their scatter does not show
 # it; for peaks of correlation (a parabola through whole cells leans towards them), and polished.
