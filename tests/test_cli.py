@@ -288,7 +288,8 @@ def test_a_crs_on_one_side_only_is_no_obstacle(tmp_path: Path, run: Run, side: s
     assert (known == "EPSG:32754") == (side == "reference")
     again = meshreg.read_survey(out / "new_registered.ply")
     assert again.crs == known
-    assert np.abs(again.centre - moving.centre - [731_000, 5_705_000, 0] - found).max() < 0.01
+    # the middle of the box: a tilt of a tenth of a degree lifts it by a centimetre
+    assert np.abs(again.centre - moving.centre - [731_000, 5_705_000, 0] - found).max() < 0.03
 
 
 def test_geometry_alone_where_the_texture_is_broken(
