@@ -2,8 +2,8 @@
 
 Sand that has risen or fallen as a sheet may be most of what is seen, but it does not look the same
 again: ground whose small relief recurs is the same ground. Within a block of such cells the ground
-is where most of them agree; among the blocks, what departs from the slow bending of all the others,
-or from its neighbours, has changed as a whole.
+is where most of them agree; among the blocks, what a step parts from the others, or what departs
+from its neighbours, has changed as a whole.
 """
 
 from __future__ import annotations

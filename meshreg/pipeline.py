@@ -10,7 +10,6 @@ off by more than the methods bear is turned first, as its tiles vote.
 from __future__ import annotations
 
 import dataclasses
-import logging
 import platform
 from collections.abc import Mapping
 from typing import Any
@@ -43,8 +42,6 @@ from meshreg.types import (
 from meshreg.voting import Turn
 from meshreg.warp import Internal, check_model, measure
 from meshreg.warp_rasters import warped_raster
-
-log = logging.getLogger(__name__)
 
 
 def register_pair(

@@ -14,7 +14,7 @@ from functools import partial
 
 import numpy as np
 
-from meshreg.kriging import Field, Ground, best_motion, design, overlap_ground
+from meshreg.kriging import Ground, best_motion, design, overlap_ground
 from meshreg.offsets import neutral
 from meshreg.offsets.surface import MAD_TO_SIGMA
 from meshreg.sandwich import block_sandwich
@@ -105,7 +105,7 @@ def refine(
     assert rough.weights is not None
     kept = tiles.only(rough.weights > 0)
     if _enough(kept):
-        best = over_ground(kept, ground, centre)[0]
+        best = over_ground(kept, ground, centre)
     else:
         best = replace(rough, covariance=misfit(tiles) * rough.covariance)
     cells = [moving.grid.cell for _, moving, _ in rasters]
@@ -147,20 +147,21 @@ def _polished(
         if not _enough(tiles):
             return None
         assert tiles is not None
-        answer, guess = over_ground(tiles, ground, start.pivot)
+        answer = over_ground(tiles, ground, start.pivot)
+        assert answer.offset_at is not None
+        guess = answer.offset_at
         step, offset = np.hypot(*(answer.offset - offset)), answer.offset
         if step < 0.005 * moving.grid.cell:
             break
     return answer
 
 
-def over_ground(tiles: TileOffsets, ground: Ground, pivot: Float64) -> tuple[Refined, Field]:
+def over_ground(tiles: TileOffsets, ground: Ground, pivot: Float64) -> Refined:
     """Rigid motion that fits the whole ground best; the yaw is 0 where it is under two sigmas.
 
     The ground counts as the reference sees it: where the models stretch, so do its cells. It might
     as well count as the moving survey sees it, which is what the same pair the other way round will
-    do: half of what that changes is added to the doubt. Also returned is the most likely offset at
-    any place, internal warp included.
+    do: half of what that changes is added to the doubt.
     """
     places, offsets = tiles.places, tiles.offsets
     motion = best_motion(places, offsets, ground, pivot, yaw_free=True)
@@ -178,7 +179,7 @@ def over_ground(tiles: TileOffsets, ground: Ground, pivot: Float64) -> tuple[Ref
     covariance = misfit(tiles) * covariance + np.outer(half, half)
     used = motion.used.astype(np.float64)
     answer = Refined(pivot, offset, yaw, covariance, tiles, weights=used, offset_at=motion.field)
-    return _with_residuals(answer), motion.field
+    return _with_residuals(answer)
 
 
 def with_scale(refined: Refined, ground: Ground) -> tuple[Refined, float]:
@@ -253,7 +254,6 @@ def fit(tiles: TileOffsets, pivot: Float64) -> Refined:
         if np.abs(step[:2]).max() < 1e-9:
             break
     residual = tiles.offsets - columns @ answer
-    normal = np.einsum("mij,m,mik->jk", columns, weights, columns)
     scores = np.einsum("mij,m,mi->mj", columns, weights, residual)
     covariance = block_sandwich(normal, scores, tiles.block, columns.shape[2])
     weights = weights / weights.max()

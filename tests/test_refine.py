@@ -248,7 +248,7 @@ def test_there_and_back_is_nothing_within_three_sigmas(size):
                 return np.abs(places + offset(places)).max(axis=1) < 9
 
             ground = uniform_ground(lambda p, seen=seen: (np.abs(p).max(axis=1) < 9) & seen(p))
-            answers.append(over_ground(found, ground, ground.share @ ground.places)[0])
+            answers.append(over_ground(found, ground, ground.share @ ground.places))
         first, second = answers
         home = first.pivot + first.offset
         arm = home - second.pivot
