@@ -136,9 +136,9 @@ def fit_heights(
     The covariance is the block sandwich (`meshreg.sandwich`) of the blocks' departures from their
     neighbours for `up`, from a slow bending (a cubic in east and north) for the tilt, over parcels
     at least two correlation lengths of these departures wide: the slow bending itself moves the
-    best fit over all ground as much as this one. Added to the variance of `up` are the squares of
-    how much it changes if nothing is left out (median of all cells: when much has changed, what
-    counts as stable ground is a choice), and of what the bending may do where no ground counts.
+    best fit over all ground as much as this one. Added to the variance of `up` is the square of how
+    much it changes if nothing is left out (median of all cells: when much has changed, what counts
+    as stable ground is a choice); to both, what the bending may do where no ground counts.
 
     Parameters
     ----------
@@ -167,26 +167,27 @@ def fit_heights(
     everything, note = pair, ""
     pair = everything.where_detail_recurs(start.transform(horizontal))
     free, plane = _settled(pair, horizontal, start, tilted=True)
-    loose = np.zeros((3, 3))
+    sheet = 0.0
     if plane is None:
         pair, note = everything, NO_DETAIL
-        loose[0, 0] = SHEET**2
+        sheet = SHEET
         free, plane = _settled(pair, horizontal, start, tilted=True)
     if plane is None:
         return _unblocked(pair, horizontal, start)
     tilt = float(np.hypot(*free.tilt))
-    significant = _significant(free.tilt, plane)
+    significant = _significant(free.tilt, plane, sheet)
     if significant and tilt > MAX_TILT:
         degrees = np.rad2deg(tilt)
         doubt = f"the surveys are tilted against each other by {degrees:.1f}°, beyond 3°"
         level, _ = _settled(pair, horizontal, start, tilted=False)
-        return replace(level, covariance=_covariance(plane) + loose, doubt=doubt, note=note)
+        return replace(level, covariance=_covariance(plane, sheet), doubt=doubt, note=note)
+    left_out = np.zeros((3, 3))
     if not significant:
         level, found = _settled(pair, horizontal, start, tilted=False)
         if found is not None:
-            loose[1:, 1:] = np.outer(free.tilt, free.tilt)
+            left_out[1:, 1:] = np.outer(free.tilt, free.tilt)
             free, plane = level, found
-    covariance = _covariance(plane) + loose
+    covariance = _covariance(plane, sheet) + left_out
     return replace(free, covariance=covariance, kept=plane.kept, sigma=plane.sigma, note=note)
 
 
@@ -293,7 +294,8 @@ class _Plane:
     lattice: tuple[Index, Index]  # (B,) row and column of the blocks
     terms: int  # of the bending that `depart` is free of
     choice: float  # change of up if nothing is left out [m]
-    unseen: float  # change of up that the bending may make where no ground counts [m]
+    unseen: float  # what the bending may do where no ground counts [m]
+    leverage: Float64  # (3, 3) what an error of 1 m does to the step if it is as bad as can be
     kept: float
     sigma: float
     ground: UInt8  # (H, W) of the moving DEM
@@ -388,7 +390,8 @@ def _plane(pair: _Pair, transform: Transform, place: Float64, *, tilted: bool) -
     counted = np.where((believed[number] == STABLE) & ~held, CHANGED, believed[number])
     state[row[counts], col[counts]] = counted
     turned = points[:, :2] - transform.apply(place)[:2]
-    flat = difference - np.column_stack([np.ones(len(row)), turned[:, 1], -turned[:, 0]]) @ step
+    everywhere = np.column_stack([np.ones(len(row)), turned[:, 1], -turned[:, 0]])
+    flat = difference - everywhere @ step
     return _Plane(
         step,
         design,
@@ -399,14 +402,15 @@ def _plane(pair: _Pair, transform: Transform, place: Float64, *, tilted: bool) -
         terms,
         float(np.median(flat)),
         float(1.0 - weight.sum() / len(row)) * float(bending),
+        len(row) * np.linalg.pinv(everywhere.T @ everywhere, hermitian=True),
         float((kept[known] * weight)[~wild].sum() / len(row)),
         sigma,
         state,
     )
 
 
-def _covariance(plane: _Plane) -> Float64:
-    """Covariance of (up, tilt_east, tilt_north).
+def _covariance(plane: _Plane, sheet: float) -> Float64:
+    """Covariance of (up, tilt_east, tilt_north); `sheet` [m] is what nothing else tells of.
 
     The bending's mean over all ground belongs to `up`; only what departs from the neighbours makes
     that err. A tilt hangs on the rim, and with it on how the models bend there.
@@ -417,8 +421,8 @@ def _covariance(plane: _Plane) -> Float64:
         less = np.sqrt(alone[0, 0] / covariance[0, 0])
         covariance[0] *= less
         covariance[:, 0] *= less
-    covariance[0, 0] += plane.choice**2 + plane.unseen**2
-    return covariance
+    covariance[0, 0] += plane.choice**2
+    return covariance + (plane.unseen**2 + sheet**2) * plane.leverage
 
 
 def _sandwich(plane: _Plane, errors: Float64) -> tuple[Float64, int]:
@@ -445,14 +449,14 @@ def _parcel_side(plane: _Plane, errors: Float64) -> int:
     return max(1, min(2 * length, min(table.shape) // 3))
 
 
-def _significant(tilt: Float64, plane: _Plane) -> bool:
+def _significant(tilt: Float64, plane: _Plane, sheet: float) -> bool:
     """Hotelling's T² at three sigmas, since the parcels may be few."""
     from scipy.special import fdtri
 
     covariance, parcels = _sandwich(plane, plane.depart)
     freedom = max(parcels - 3, 1)
     limit = 2 * (freedom + 1) / freedom * float(fdtri(2, freedom, 0.9973))
-    squared = covariance[1:, 1:]
+    squared = (covariance + (plane.unseen**2 + sheet**2) * plane.leverage)[1:, 1:]
     if np.hypot(*tilt) < 1e-9:  # rounding
         return False
     return bool(tilt @ np.linalg.pinv(squared, hermitian=True) @ tilt > limit)

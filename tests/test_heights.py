@@ -220,7 +220,36 @@ def test_ground_without_detail_is_not_believed_to_have_stayed():
     found = fit_heights(bare[0], lowered(bare[1], 0.05), HERE)
     assert found.up == pytest.approx(0.05, abs=0.005)
     assert np.sqrt(found.covariance[0, 0]) >= SHEET
+    half = np.ptp(places(relief())[0]) / np.sqrt(12)  # m, from the middle, rms
+    assert np.sqrt(np.diag(found.covariance)[1:]) >= pytest.approx(SHEET / half, rel=0.1)
     assert "sand" in found.note
+
+
+def test_where_no_ground_counts_the_models_may_bend():
+    """Only the east tells; the stated region knows that the west may have bent otherwise.
+
+    A tilt that a strip of ground shows is the strip's own: it is no more than the bending is.
+    """
+    rock, again = relief(), relief(noise_seed=1)
+    east, north = places(rock)
+    design = np.stack([np.ones(east.size), north.ravel(), -east.ravel()], axis=1)
+    deviations = []
+    for seed in range(6):
+        bowl = waves(rock, 70 + seed, 14.0, 0.04)
+        best = np.linalg.lstsq(design, bowl.ravel(), rcond=None)[0]
+        plants = [
+            np.where(east < 2.5, waves(rock, 100 + 2 * seed + k, 0.35, 0.03), 0.0) for k in (0, 1)
+        ]
+        still = dataclasses.replace(rock, height=rock.height + plants[0])
+        bent = dataclasses.replace(again, height=again.height + plants[1] - bowl)
+        for first, second, truth in ((still, bent, best), (bent, still, -best)):
+            heights = fit_heights(first, second, HERE)
+            assert not heights.note
+            assert (heights.ground[east < 2.0] == STABLE).mean() < 0.15
+            miss = np.append(heights.up, heights.tilt) - truth
+            deviations.append(np.sqrt(miss**2 / np.diag(heights.covariance)))
+    assert np.max(deviations) < 3.5
+    assert np.median(deviations) > 0.05  # nor is anything allowed
 
 
 @functools.cache
