@@ -380,7 +380,7 @@ def _plane(pair: _Pair, transform: Transform, place: Float64, *, tilted: bool) -
     around = np.where(told, around, rest)
     value = np.where(wild, bent + around, value)
     step = least_squares(design, weight, value)
-    bending = np.sqrt(np.average((value - design @ step) ** 2, weights=weight))
+    bending = float(np.sqrt(np.average((value - design @ step) ** 2, weights=weight)))
     if not tilted:
         step = np.array([np.average(value, weights=weight), 0.0, 0.0])
     believed = np.full(len(cells), UNKNOWN, np.uint8)
@@ -392,6 +392,8 @@ def _plane(pair: _Pair, transform: Transform, place: Float64, *, tilted: bool) -
     turned = points[:, :2] - transform.apply(place)[:2]
     everywhere = np.column_stack([np.ones(len(row)), turned[:, 1], -turned[:, 0]])
     flat = difference - everywhere @ step
+    wider = _wider(everywhere, design, weight, side * pair.moving.grid.cell)
+    unseen = (1.0 - float(weight.sum()) / len(row)) * bending * wider
     return _Plane(
         step,
         design,
@@ -401,12 +403,27 @@ def _plane(pair: _Pair, transform: Transform, place: Float64, *, tilted: bool) -
         (lattice[:, 0], lattice[:, 1]),
         terms,
         float(np.median(flat)),
-        float(1.0 - weight.sum() / len(row)) * float(bending),
+        unseen,
         len(row) * np.linalg.pinv(everywhere.T @ everywhere, hermitian=True),
         float((kept[known] * weight)[~wild].sum() / len(row)),
         sigma,
         state,
     )
+
+
+def _wider(everywhere: Float64, design: Float64, weight: Float64, block: float) -> float:
+    """By how much more all the ground departs from a plane than the ground that counts shows.
+
+    Bends grow with the width over which they are seen: rough ones by its root, a dome by its
+    square. Taken as the width itself, where the ground that counts is the narrowest beside all.
+    """
+    from scipy.linalg import eigh
+
+    middle = np.average(design[:, 1:], axis=0, weights=weight)
+    seen, every = design[:, 1:] - middle, everywhere[:, 1:] - middle
+    narrow = (seen * weight[:, None]).T @ seen / weight.sum() + block**2 / 12 * np.eye(2)
+    ratio = eigh(every.T @ every / len(every), narrow, eigvals_only=True)
+    return max(1.0, float(np.sqrt(ratio[-1])))
 
 
 def _covariance(plane: _Plane, sheet: float) -> Float64:

@@ -221,15 +221,12 @@ def test_ground_without_detail_is_not_believed_to_have_stayed():
     assert found.up == pytest.approx(0.05, abs=0.005)
     assert np.sqrt(found.covariance[0, 0]) >= SHEET
     half = np.ptp(places(relief())[0]) / np.sqrt(12)  # m, from the middle, rms
-    assert np.sqrt(np.diag(found.covariance)[1:]) >= pytest.approx(SHEET / half, rel=0.1)
+    assert (np.sqrt(np.diag(found.covariance)[1:]) >= 0.9 * SHEET / half).all()
     assert "sand" in found.note
 
 
 def test_where_no_ground_counts_the_models_may_bend():
-    """Only the east tells; the stated region knows that the west may have bent otherwise.
-
-    A tilt that a strip of ground shows is the strip's own: it is no more than the bending is.
-    """
+    """Only a third tells, all in the east; the stated region knows that the west may bend."""
     rock, again = relief(), relief(noise_seed=1)
     east, north = places(rock)
     design = np.stack([np.ones(east.size), north.ravel(), -east.ravel()], axis=1)
@@ -248,7 +245,7 @@ def test_where_no_ground_counts_the_models_may_bend():
             assert (heights.ground[east < 2.0] == STABLE).mean() < 0.15
             miss = np.append(heights.up, heights.tilt) - truth
             deviations.append(np.sqrt(miss**2 / np.diag(heights.covariance)))
-    assert np.max(deviations) < 3.5
+    assert np.max(deviations) < 3.0  # without that, tilts err by six
     assert np.median(deviations) > 0.05  # nor is anything allowed
 
 
