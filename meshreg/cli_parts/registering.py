@@ -31,6 +31,13 @@ if TYPE_CHECKING:
     from meshreg.types import Registration, Survey
 
 
+_NEEDED = (
+    "cv2", "scipy.fft", "scipy.ndimage", "scipy.spatial", "meshreg.pipeline", "meshreg.report",
+    "meshreg.io.record", "rasterio", "tomli_w", "scipy.sparse.csgraph", "scipy.interpolate",
+    "matplotlib.cm", "PIL.WebPImagePlugin",
+)  # fmt: skip
+
+
 @dataclass(frozen=True)
 class RegisterRequest:
     """Everything that `meshreg register` was asked."""
@@ -62,10 +69,7 @@ def register_into(folder: Path, request: RegisterRequest, progress: Progress) ->
     _log_start(request)
     with draughtsman(request.reference.path, request.moving.path) as draw:
         # not before: cv2 changes sys.path while it is imported, and the new process gets a copy
-        import_early(
-            "cv2", "scipy.fft", "scipy.ndimage", "scipy.spatial", "meshreg.pipeline",
-            "meshreg.report", "meshreg.io.record", "rasterio", "tomli_w",
-        )  # fmt: skip
+        import_early(*_NEEDED)
         clock = time.perf_counter()
         reference, moving, notes = _read_both(request, progress)
         masks = read_masks(request.masks, {"reference": reference, "moving": moving})

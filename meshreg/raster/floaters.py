@@ -8,10 +8,11 @@ the tip of a branch that the reconstruction tore off stays close to the rest.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from meshreg.types import Bool, Float64, Int32
+from meshreg.types import Bool, Float64, Int32, Mesh
 
 _SMALL = 0.05  # share of the ground (mesh) that a floater may cover, and that all together may
 _FEW = 0.01  # share of the points (cloud) that all floaters together may be
@@ -20,19 +21,31 @@ _GAP_SPACINGS = 3.0  # least gap beneath a floater, in point spacings
 _GAP_EXTENTS = 0.5  # and in its own horizontal extents: a table coral torn off its stem is wide
 
 
-def floating_faces(points: Float64, faces: Int32, spacing: float, unit: float) -> Bool:
+_LEVEL = np.cos(np.deg2rad(5.0))  # a tilt below that makes nothing float
+_KEPT: WeakKeyDictionary[Mesh, Bool] = WeakKeyDictionary()  # a pair asks thrice
+
+
+def faces_to_keep(mesh: Mesh, up: Float64, spacing: float) -> Bool:
     """Return for each face (F,) whether to keep it, or an empty array to keep all.
 
     Parameters
     ----------
-    points : (V, 3) float64
-        Column, row [in units of `unit` metres], height [m].
-    faces : (F, 3) int32
+    mesh : Mesh
+    up : (3,) float64
+        Direction in the mesh's own coordinates.
     spacing : float
-        Of neighbouring vertices, in the units of the columns.
-    unit : float
-        Metres to a column.
+        Of neighbouring vertices there.
     """
+    up = up / np.linalg.norm(up)
+    if up[2] >= _LEVEL:
+        if mesh not in _KEPT:
+            _KEPT[mesh] = _grounded(mesh.vertices, mesh.faces, spacing)
+        return _KEPT[mesh]
+    across = np.linalg.svd(up[None, :])[2][1:]  # any two that are level
+    return _grounded(mesh.vertices @ np.vstack([across, up]).T, mesh.faces, spacing)
+
+
+def _grounded(points: Float64, faces: Int32, spacing: float) -> Bool:
     from meshreg.raster import floater_kernels as kernels
 
     everything = np.empty(0, bool)
@@ -48,11 +61,9 @@ def floating_faces(points: Float64, faces: Int32, spacing: float, unit: float) -
     main = area > _SMALL * total
     if main.all() or area[main].sum() < 0.5 * total:
         return everything
-    low[:, :2], high[:, :2], spacing = low[:, :2] * unit, high[:, :2] * unit, spacing * unit
     square = 2.0 * spacing
     corners = np.flatnonzero(kernels.corners_of(faces, main[label], len(points)))
-    places = points[corners] * np.array([unit, unit, 1.0])
-    gone = standing_clear(places, low, high, ~main, spacing, square)
+    gone = standing_clear(points[corners], low, high, ~main, spacing, square)
     if not gone.any() or area[gone].sum() > _SMALL * total:
         return everything
     return np.asarray(~gone[label])

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from meshreg.raster.finish import Layers, empty_layers
-from meshreg.raster.floaters import floating_faces
+from meshreg.raster.floaters import faces_to_keep
 from meshreg.raster.grid import LEAST_SHARE
 from meshreg.raster.placing import Placing
 from meshreg.raster.spacing import Spacing
@@ -64,9 +64,7 @@ def draw_mesh(
     masked: dict[str, int] = {}
     keep = np.empty(0, bool)
     if settings.remove_floaters:
-        keep = floating_faces(
-            points, mesh.faces, spacing.points * times / grid.cell, grid.cell / times
-        )
+        keep = faces_to_keep(mesh, placing.linear[2], spacing.points / placing.scale)
         masked["floaters"] = int(np.count_nonzero(~keep))
     band_rows = _band_rows(rows, cols, times)
     bands, sums = kernels.face_bands(
