@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,7 @@ from meshreg.heading import (
 )
 from meshreg.heights import Heights, fit_heights
 from meshreg.offsets import ESTIMATORS, estimate_offset
+from meshreg.offsets.neutral import FieldsOf, pair_fields
 from meshreg.refine import Refined, dem_ground, refine, with_scale
 from meshreg.settings import Settings
 from meshreg.types import (
@@ -148,8 +150,9 @@ def _in_frame(
     motion, first = (None, pairs) if delivered is None else delivered
     scale = 1.0
     estimates: list[OffsetEstimate] = []
+    fields = cache(pair_fields)  # until the end of this function: they are as large as the rasters
     with ThreadPoolExecutor(1) as beside:  # the evidence does not depend on what the methods say
-        maps = beside.submit(judging.channel_maps, pairs, radius)
+        maps = beside.submit(judging.channel_maps, pairs, radius, fields)
         for method in settings.methods:
             with clock.stage(method):
                 pair = pairs[ESTIMATORS[method].raster]
@@ -164,7 +167,7 @@ def _in_frame(
     notes: tuple[str, ...] = ()
     if judgement.best is not None and judgement.verdict != "rejected":
         with clock.stage("refine"):
-            refined = _refine(judgement, pairs, settings)
+            refined = _refine(judgement, pairs, settings, fields)
             if settings.search.free_scale or (motion is not None and motion.scale != 1.0):
                 ground = dem_ground(*pairs["dem"], refined.offset)
                 refined, scale = with_scale(refined, ground)
@@ -191,7 +194,9 @@ def _within(radius: float, estimate: OffsetEstimate) -> OffsetEstimate:
     )
 
 
-def _refine(judgement: judging.Judgement, pairs: Pairs, settings: Settings) -> Refined:
+def _refine(
+    judgement: judging.Judgement, pairs: Pairs, settings: Settings, fields: FieldsOf
+) -> Refined:
     best = judgement.best
     assert best is not None
     # a channel that does not put this offset first has tiles of chance: leave it out
@@ -203,7 +208,8 @@ def _refine(judgement: judging.Judgement, pairs: Pairs, settings: Settings) -> R
     if not used:
         used = [(*pairs["dem"], "terrain")]
     agree = judging.agree_distance(settings.judge, pairs["dem"][0].grid.cell)
-    return refine(used, (best.east, best.north), best.sigma, agree)  # type: ignore[arg-type]
+    at = best.east, best.north
+    return refine(used, at, best.sigma, agree, fields)  # type: ignore[arg-type]
 
 
 def _horizontal(refined: Refined, scale: float = 1.0) -> Transform:

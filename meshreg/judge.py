@@ -117,7 +117,9 @@ class Judgement:
 
 
 def channel_maps(
-    rasters: Mapping[str, tuple[SurveyRaster, SurveyRaster]], radius: float
+    rasters: Mapping[str, tuple[SurveyRaster, SurveyRaster]],
+    radius: float,
+    fields: neutral.FieldsOf = neutral.pair_fields,
 ) -> dict[str, ChannelMap]:
     """Compute the evidence of each channel, "terrain" and "image", that has any.
 
@@ -127,10 +129,12 @@ def channel_maps(
         "dem" and "ortho" to (reference, moving).
     radius : float
         Half width of the search window [m].
+    fields : callable, optional
+        Instead of `neutral.pair_fields`, where their fields are known already.
     """
     maps: dict[str, ChannelMap] = {}
     for channel, raster in (("terrain", "dem"), ("image", "ortho")):
-        found = channel_map(*rasters[raster], channel, radius, SCORED_OVERLAP)  # type: ignore[arg-type]
+        found = channel_map(*rasters[raster], channel, radius, SCORED_OVERLAP, fields)  # type: ignore[arg-type]
         if found is not None:
             maps[channel] = found
     return maps
@@ -210,6 +214,7 @@ def channel_map(
     channel: neutral.Channel,
     radius: float,
     min_overlap: float,
+    fields: neutral.FieldsOf = neutral.pair_fields,
 ) -> ChannelMap | None:
     """Compute a channel's evidence and its null; None where there is nothing to compare."""
     valid = (
@@ -219,7 +224,7 @@ def channel_map(
     )
     if min(int(mask.sum()) for mask in valid) < 100:
         return None
-    first, second = neutral.fields(reference, channel), neutral.fields(moving, channel)
+    first, second = fields(reference, moving, channel)
     transformed: dict[tuple[int, int], neutral.Spectra] = {}
 
     def look(

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 import platform
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -53,6 +53,7 @@ def register_pair(
     moving_mask: Any = None,
     manual: Manual | None = None,
     progress: Progress | None = None,
+    settled: Callable[[Transform], object] | None = None,
 ) -> Registration:
     """Lay the moving (repeat) survey on the reference (original) one, and say how sure that is.
 
@@ -68,6 +69,9 @@ def register_pair(
         survey as `motion` turned it first, if that is not None. It is judged like the methods'.
     progress : callable, optional
         Called with a stage's name and the fraction of it that is done.
+    settled : callable, optional
+        Called with the transform once it stands, before the surveys are laid down and compared, if
+        that is all by which the moving survey will be moved: not where a warp is asked for.
 
     Returns
     -------
@@ -116,6 +120,8 @@ def register_pair(
                 covariance, said.transform, said.transform.apply(place)
             )
         transform, notes = said.transform, [*notes, said.note]
+    if settled is not None and transform is not None and settings.warp.model == "none":
+        settled(transform)
     with clock.stage("apply"):
         rasters = lay_down(moving, transform, settings, masks, pairs)
     with clock.stage("internal"):

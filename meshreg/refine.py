@@ -80,6 +80,7 @@ def refine(
     offset: tuple[float, float],
     sigma: Float64,
     agree: float,
+    fields: neutral.FieldsOf = neutral.pair_fields,
 ) -> Refined:
     """Refine an offset and find a small yaw (to ±1°) from the offsets of tiles.
 
@@ -93,11 +94,13 @@ def refine(
         Its covariance, used where the tiles are too few.
     agree : float
         The refined offset may differ from the judged one by this much [m].
+    fields : callable, optional
+        Instead of `neutral.pair_fields`, where their fields are known already.
     """
     ground = dem_ground(rasters[0][0], rasters[0][1], offset)
     centre = ground.share @ ground.places
     coarse = Refined(centre, np.array(offset), 0.0, _block_diagonal(sigma, MAX_YAW**2 / 9))
-    tiles = _joined([correlated_tiles(a, b, channel, offset) for a, b, channel in rasters])
+    tiles = _joined([correlated_tiles(a, b, channel, offset, fields) for a, b, channel in rasters])
     if not _enough(tiles):
         return replace(coarse, note="too few tiles match on their own to measure yaw")
     assert tiles is not None

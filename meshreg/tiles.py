@@ -100,12 +100,13 @@ def correlated_tiles(
     moving: SurveyRaster,
     channel: neutral.Channel,
     offset: tuple[float, float],
+    fields: neutral.FieldsOf = neutral.pair_fields,
 ) -> TileOffsets | None:
     """Match each tile by the neutral measure, within the reach of a yaw of ±1°."""
     overlap = Overlap.at(reference.grid, moving.grid, offset)
     if overlap.side < 32:
         return None
-    first, second = neutral.fields(reference, channel), neutral.fields(moving, channel)
+    first, second = fields(reference, moving, channel)
     side = int(np.clip(overlap.side // 5, 16, 128))
     span = overlap.rows[1] - overlap.rows[0], overlap.cols[1] - overlap.cols[0]
     reach = int(np.ceil(0.5 * np.hypot(*span) * MAX_YAW)) + 3
@@ -153,7 +154,7 @@ def _correlate_tile(
         np.asarray(-steps * cell, np.float64),
         (a.mask.shape, b.mask.shape),
     )
-    correlator = Correlator(window, workers=1)
+    correlator = Correlator(window, single=True, workers=1)
     surface, _ = neutral.surface(
         neutral.spectra(a, correlator), neutral.spectra(b, correlator), correlator, 0.5
     )

@@ -1,4 +1,4 @@
-"""Figures drawn by a second process are those that this one would draw."""
+"""Figures drawn with a second process are those that this one would draw."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import dataclasses
 import logging
 import os
 import signal
+import time
 from pathlib import Path
 
 import numpy as np
@@ -25,15 +26,22 @@ def apart(monkeypatch):
 
 
 def test_a_small_pair_gets_no_process_of_its_own():
-    with drawing.draughtsman(SMALL, SMALL) as draw:
-        assert draw is draw_figures
+    with drawing.draughtsman(SMALL, SMALL) as begin:
+        finish = begin("registration", "folder")
+    assert finish.func is draw_figures
+    assert finish.args == ("registration", "folder")
 
 
 @pytest.mark.usefixtures("apart")
-def test_the_other_process_draws_the_same(tmp_path: Path) -> None:
+@pytest.mark.parametrize("patient", [0, 3, 8])
+def test_both_processes_draw_the_same(tmp_path: Path, patient: int) -> None:
+    """Whether this one helps from the beginning, with the rest, or hardly at all."""
     registration = made_registration("accepted")
-    with drawing.draughtsman(SMALL, SMALL) as draw:
-        draw(registration, tmp_path / "there")
+    with drawing.draughtsman(SMALL, SMALL) as begin:
+        finish = begin(registration, tmp_path / "there")
+        while patient and len(list((tmp_path / "there").glob("*.png"))) < patient:
+            time.sleep(0.02)
+        finish()
     draw_figures(registration, tmp_path / "here")
     here, there = (sorted((tmp_path / name).glob("*.png")) for name in ("here", "there"))
     assert [path.name for path in there] == [path.name for path in here]
@@ -48,8 +56,8 @@ def test_what_it_says_is_logged_here(tmp_path: Path, caplog: pytest.LogCaptureFi
     accepted = made_registration("accepted")
     evidence = {**accepted.evidence, "residuals": {"east": np.zeros(2)}}
     broken = dataclasses.replace(accepted, evidence=evidence)
-    with caplog.at_level(logging.INFO, "meshreg"), drawing.draughtsman(SMALL) as draw:
-        draw(broken, tmp_path)
+    with caplog.at_level(logging.INFO, "meshreg"), drawing.draughtsman(SMALL) as begin:
+        begin(broken, tmp_path)()
     assert any("residuals was not drawn" in message for message in caplog.messages)
     assert not (tmp_path / "residuals.png").exists()
     assert (tmp_path / "extents.png").is_file()
@@ -59,8 +67,8 @@ def test_what_it_says_is_logged_here(tmp_path: Path, caplog: pytest.LogCaptureFi
 def test_an_error_there_is_an_error_here(tmp_path: Path) -> None:
     taken = tmp_path / "taken"
     taken.write_text("a file where the folder should be")
-    with drawing.draughtsman(SMALL) as draw, pytest.raises(FileExistsError):
-        draw(made_registration("rejected"), taken)
+    with drawing.draughtsman(SMALL) as begin, pytest.raises(FileExistsError):
+        begin(made_registration("rejected"), taken)()
 
 
 @pytest.mark.usefixtures("apart")
@@ -76,8 +84,8 @@ def test_if_it_dies_the_figures_are_drawn_here(
         return started[-1]
 
     monkeypatch.setattr(context, "Process", noted)
-    with drawing.draughtsman(SMALL) as draw:
+    with drawing.draughtsman(SMALL) as begin:
         os.kill(started[0].pid, signal.SIGKILL)
         started[0].join(10)
-        draw(made_registration("rejected"), tmp_path)
+        begin(made_registration("rejected"), tmp_path)()
     assert (tmp_path / "extents.png").is_file()

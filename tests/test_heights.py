@@ -15,7 +15,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates, uniform_filter
 
 from meshreg import statistics
 from meshreg.errors import UsageError
-from meshreg.ground import SEEN, largest_sheet
+from meshreg.ground import SEEN, largest_sheet, neighbours
 from meshreg.heights import (
     CHANGED,
     MAX_TILT,
@@ -324,6 +324,22 @@ def test_the_largest_sheet_goes_on_behind_a_gap(seed, wide):
     seen = np.abs(lattice[..., 1] - 7) >= 0.5 * wide
     found = largest_sheet(lattice[seen], value[seen], np.ones(seen.sum()))
     assert found.mean() > 0.97
+
+
+@given(st.data())
+def test_neighbours_are_the_median_of_what_is_known_around(data):
+    shape = data.draw(st.tuples(st.integers(1, 9), st.integers(1, 9)))
+    values = st.one_of(st.just(np.nan), st.floats(-1, 1))
+    table = np.array(data.draw(st.lists(values, min_size=81, max_size=81))).reshape(9, 9)
+    lattice = np.argwhere(np.ones(shape, bool))
+    found = neighbours(lattice, table[tuple(lattice.T)])
+    table[shape[0] :] = table[:, shape[1] :] = np.nan
+    for (row, col), value in zip(lattice, found, strict=True):
+        around = table[max(row - 2, 0) : row + 3, max(col - 2, 0) : col + 3]
+        known = around[np.isfinite(around)]
+        assert value == (
+            pytest.approx(np.median(known)) if known.size else pytest.approx(np.nan, nan_ok=True)
+        )
 
 
 def test_the_largest_sheet_of_blocks_in_one_line():

@@ -1,8 +1,9 @@
-"""The figures of a large pair are drawn by a second process.
+"""The figures of a large pair are drawn by a second process while this one writes the result.
 
 Matplotlib holds the interpreter for seconds, in which nothing else of ours could go on. The process
 is started before the surveys are read, so that what it has to load, Matplotlib and VTK, is there
-when they are registered. A small pair is not worth one: there a thread draws.
+when they are registered. Once all else is written, this process draws what is left with it. A small
+pair is not worth a second process.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import queue
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from functools import partial
 from multiprocessing.connection import Connection
 from multiprocessing.reduction import ForkingPickler
 from pathlib import Path
@@ -27,7 +29,7 @@ from meshreg.errors import MeshregError
 if TYPE_CHECKING:
     from meshreg.types import Registration
 
-Draw = Callable[["Registration", Path], object]
+Begin = Callable[["Registration", Path], Callable[[], object]]
 LARGE = 30e6  # bytes of both surveys' files together
 
 
@@ -40,20 +42,25 @@ ForkingPickler.register(MappingProxyType, lambda frozen: (_frozen, (dict(frozen)
 
 
 @contextmanager
-def draughtsman(*surveys: str) -> Iterator[Draw]:
-    """Give what draws the figures of a registration of these surveys' files into a folder."""
+def draughtsman(*surveys: str) -> Iterator[Begin]:
+    """Give what draws the figures of a registration of these surveys' files.
+
+    ``begin(registration, folder)`` may start on them elsewhere, and returns what is to be called
+    for all to be there.
+    """
     if sum(_size(path) for path in surveys) < LARGE:
         from meshreg.report import draw_figures
 
-        yield draw_figures
+        yield lambda registration, folder: partial(draw_figures, registration, folder)
         return
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
-    process = context.Process(target=_serve, args=(theirs,), daemon=True)
+    following = context.Value("i", 0)
+    process = context.Process(target=_serve, args=(theirs, following), daemon=True)
     process.start()
     theirs.close()
     try:
-        yield lambda registration, folder: _drawn_there(ours, registration, folder)
+        yield partial(_begun_there, ours, partial(_claimed, following))
     finally:
         ours.close()
         process.terminate()
@@ -71,24 +78,41 @@ def _size(path: str) -> int:
     return 0
 
 
-def _drawn_there(pipe: Connection, registration: Registration, folder: Path) -> None:
-    """Hand the work over and log what was said of it; draw here if the process is gone."""
+def _claimed(following: Any, number: int) -> bool:
+    """Take the figure of this number, unless the other process, which goes in order too, has."""
+    with following.get_lock():
+        free = bool(number >= following.value)
+        if free:
+            following.value = number + 1
+    return free
+
+
+def _begun_there(
+    pipe: Connection, claim: Callable[[int], bool], registration: Registration, folder: Path
+) -> Callable[[], None]:
+    """Hand the work over; what is returned helps with it, and logs what was said of it there."""
     from meshreg.report import draw_figures
 
-    try:
+    with suppress(OSError):  # told by `recv`
         pipe.send((registration, folder))
-        said = pipe.recv()
-    except (EOFError, OSError) as error:
-        LOG.debug("the process that draws has ended: %r", error)
-        draw_figures(registration, folder)
-        return
-    if isinstance(said, BaseException):
-        raise said
-    for record in said:
-        LOG.handle(record)
+
+    def finish() -> None:
+        draw_figures(registration, folder, scene_seconds=0, claim=claim)
+        try:
+            said = pipe.recv()
+        except (EOFError, OSError) as error:
+            LOG.debug("the process that draws has ended: %r", error)
+            draw_figures(registration, folder)
+            return
+        if isinstance(said, BaseException):
+            raise said
+        for record in said:
+            LOG.handle(record)
+
+    return finish
 
 
-def _serve(pipe: Connection) -> None:
+def _serve(pipe: Connection, following: Any) -> None:
     """Wait for one registration, draw it, and send back what was logged, or the error."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's business
     gc.disable()  # it lives for one registration
@@ -103,7 +127,8 @@ def _serve(pipe: Connection) -> None:
         first.canvas.draw()
         try:
             registration, folder = pipe.recv()
-            draw_figures(registration, folder, renderer=ready)
+            claim = partial(_claimed, following)
+            draw_figures(registration, folder, renderer=ready, claim=claim)
         except EOFError:
             raise
         except Exception as error:

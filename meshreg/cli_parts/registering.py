@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import sys
 import time
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -28,13 +28,14 @@ from meshreg.cli_parts.validating import read_manual
 from meshreg.settings import Settings
 
 if TYPE_CHECKING:
-    from meshreg.types import Registration, Survey
+    from meshreg.types import Registration, Survey, Transform
 
 
 _NEEDED = (
     "cv2", "scipy.fft", "scipy.ndimage", "scipy.spatial", "meshreg.pipeline", "meshreg.report",
     "meshreg.io.record", "rasterio", "tomli_w", "scipy.sparse.csgraph", "scipy.interpolate",
-    "matplotlib.cm", "PIL.WebPImagePlugin",
+    "matplotlib.backends.backend_agg", "matplotlib.figure", "PIL.WebPImagePlugin",
+    "meshreg.io.geotiff_write", "meshreg.io.obj_write", "pyproj.crs",
 )  # fmt: skip
 
 
@@ -63,11 +64,15 @@ def register(request: RegisterRequest, voice: Voice, unfinished: Unfinished) -> 
 
 def register_into(folder: Path, request: RegisterRequest, progress: Progress) -> Registration:
     """Read, register, write everything into a folder that is there already."""
-    from meshreg.io import unchanged
+    from meshreg.io import rewrite_survey, unchanged
     from meshreg.io.frames import common_crs
+    from meshreg.types import Maps
 
     _log_start(request)
-    with draughtsman(request.reference.path, request.moving.path) as draw:
+    with (
+        draughtsman(request.reference.path, request.moving.path) as draw,
+        ThreadPoolExecutor(1) as beside,
+    ):
         # not before: cv2 changes sys.path while it is imported, and the new process gets a copy
         import_early(*_NEEDED)
         clock = time.perf_counter()
@@ -85,6 +90,12 @@ def register_into(folder: Path, request: RegisterRequest, progress: Progress) ->
         from meshreg.io.record import with_frames, write_record_files
         from meshreg.pipeline import register_pair
 
+        moved: list[Future[tuple[Path, ...]]] = []
+
+        def settled(transform: Transform) -> None:
+            if not isinstance(moving.geometry, Maps):  # whose kernels want the machine alone
+                moved.append(beside.submit(rewrite_survey, moving, transform, folder, reference))
+
         registration = register_pair(
             reference,
             moving,
@@ -93,6 +104,7 @@ def register_into(folder: Path, request: RegisterRequest, progress: Progress) ->
             moving_mask=masks["moving"],
             manual=manual,
             progress=progress,
+            settled=settled,
         )
         for survey in (reference, moving):
             unchanged(survey)
@@ -109,12 +121,17 @@ def register_into(folder: Path, request: RegisterRequest, progress: Progress) ->
         )
         _log_result(registration)
         progress("write", 0.0)
-        with ThreadPoolExecutor(1) as beside:  # a failure of either ends the job, and the folder
-            figures = beside.submit(draw, registration, folder / "figures")
-            write_record_files(registration, folder, reference=reference, moving=moving)
-            add_report(registration, folder)
-            progress("figures", 0.0)
-            figures.result()
+        finish = draw(registration, folder / "figures")
+        write_record_files(
+            registration,
+            folder,
+            reference=reference,
+            moving=moving,
+            moved=None if not moved else moved[0].result,
+        )
+        add_report(registration, folder)
+        progress("figures", 0.0)
+        finish()
     progress("figures", 1.0)
     return registration
 

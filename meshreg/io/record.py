@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -71,8 +72,12 @@ def write_record_files(
     *,
     reference: Survey | None = None,
     moving: Survey | None = None,
+    moved: Callable[[], tuple[Path, ...]] | None = None,
 ) -> tuple[Path, ...]:
-    """Write what `write_registration` does into a folder that is there (and not yet final)."""
+    """Write what `write_registration` does into a folder that is there (and not yet final).
+
+    `moved` waits for the files of the registered survey, where they are being written already.
+    """
     import tomli_w
 
     registration = with_frames(registration, reference, moving)
@@ -88,7 +93,10 @@ def write_record_files(
             from meshreg.io import rewrite_survey
 
             warp = registration.warp
-            written += rewrite_survey(moving, transform, folder, reference, warp=warp)
+            moved = moved or partial(
+                rewrite_survey, moving, transform, folder, reference, warp=warp
+            )
+            written += moved()
     text = to_json(registration_document(registration))
     written.append(_write_text(folder / "registration.json", text))
     return tuple(written)

@@ -9,7 +9,9 @@ A moving raster laid `s` rows and columns further on the reference pairs the cel
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -19,6 +21,7 @@ from meshreg.errors import UsageError
 from meshreg.types import Bool, Float64, Grid
 
 Complex = NDArray[np.complexfloating[Any, Any]]
+_SMALL = 1 << 16  # cells of a transform; more of them at once would leave the cache
 WORKERS = min(2, os.cpu_count() or 1)  # fixed, so that results do not depend on the machine's size
 
 
@@ -87,7 +90,7 @@ class Window:
                 return True
         return False
 
-    @property
+    @cached_property
     def padded(self) -> tuple[int, int]:
         """Smallest FFT size at which no offset in the window wraps round."""
         from scipy.fft import next_fast_len
@@ -123,11 +126,28 @@ class Correlator:
 
     def sums(self, *pairs: tuple[Complex, Complex]) -> Float64:
         """``sum over pairs of sum_r a[r + s] b[r]`` for each offset, (K, L) float64."""
-        product = pairs[0][0] * np.conj(pairs[0][1])
-        for a, b in pairs[1:]:
-            product += a * np.conj(b)
+        return self._windowed(_product(pairs))
+
+    def transforms(self, arrays: Sequence[Any]) -> Sequence[Complex]:
+        """Forward transform of each; of small ones at once, since each call has its price."""
+        if self._small:
+            return list(self.transform(np.stack(arrays)))
+        return [self.transform(array) for array in arrays]
+
+    def all_sums(self, *sums: Sequence[tuple[Complex, Complex]]) -> Sequence[Float64]:
+        """Compute `sums` of each set of pairs; of small ones at once."""
+        if self._small:
+            return list(self._windowed(np.stack([_product(pairs) for pairs in sums])))
+        return [self.sums(*pairs) for pairs in sums]
+
+    @property
+    def _small(self) -> bool:
+        rows, cols = self.window.padded
+        return rows * cols <= _SMALL
+
+    def _windowed(self, product: Complex) -> Float64:
         cols = self.window.cols % self.window.padded[1]
-        return np.asarray(self.rows_back(product)[:, cols], np.float64)
+        return np.asarray(self.rows_back(product)[..., cols], np.float64)
 
     def rows_back(self, product: Any) -> Any:
         """Inverse transform (..., K, padded columns) of the window's rows alone.
@@ -144,6 +164,13 @@ class Correlator:
     def counts(self, a: Complex, b: Complex) -> Float64:
         """Like `sums`, of two masks: whole numbers."""
         return np.rint(self.sums((a, b)))
+
+
+def _product(pairs: Sequence[tuple[Complex, Complex]]) -> Complex:
+    product = pairs[0][0] * np.conj(pairs[0][1])
+    for a, b in pairs[1:]:
+        product += a * np.conj(b)
+    return product
 
 
 def overlap_floor(counts: Float64, share: float) -> Bool:

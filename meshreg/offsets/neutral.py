@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import islice
 from typing import Any, Literal
 
 import numpy as np
@@ -20,6 +21,7 @@ from meshreg.offsets.correlate import Complex, Correlator, overlap_floor
 from meshreg.offsets.surface import MAD_TO_SIGMA
 from meshreg.types import Bool, Float64, Grid, SurveyRaster
 
+_MANY = 1 << 16  # offsets: a quarter of them tells their spread as well
 Channel = Literal["terrain", "image"]
 Kind = Literal["scalar", "vector", "director"]
 Parts = tuple[Float64, ...]
@@ -120,6 +122,16 @@ def fields(raster: SurveyRaster, channel: Channel) -> Fields:
     return Fields(inner, kept, kinds)
 
 
+def pair_fields(
+    reference: SurveyRaster, moving: SurveyRaster, channel: Channel
+) -> tuple[Fields, Fields]:
+    """Return `fields` of both surveys."""
+    return fields(reference, channel), fields(moving, channel)
+
+
+FieldsOf = Callable[[SurveyRaster, SurveyRaster, Channel], tuple[Fields, Fields]]
+
+
 @dataclass(frozen=True)
 class Spectra:
     """Forward transforms of a raster's fields, made once for many windows of one shape."""
@@ -131,11 +143,12 @@ class Spectra:
 
 def spectra(of: Fields, correlator: Correlator) -> Spectra:
     """Transform a raster's fields."""
-    return Spectra(
-        correlator.transform(of.mask),
-        tuple(tuple(correlator.transform(p) for p in field) for field in of.parts),
-        tuple(correlator.transform(sum(p**2 for p in field)) for field in of.parts),
-    )
+    powers = [sum(p**2 for p in field) for field in of.parts]
+    parts = [p for field in of.parts for p in field]
+    mask, *rest = correlator.transforms([of.mask, *powers, *parts])
+    after = iter(rest[len(powers) :])
+    fields = tuple(tuple(islice(after, len(field))) for field in of.parts)
+    return Spectra(mask, fields, tuple(rest[: len(powers)]))
 
 
 def surface(
@@ -155,9 +168,10 @@ def surface(
     for a, b, power_a, power_b in zip(
         first.parts, second.parts, first.powers, second.powers, strict=True
     ):
-        cross = correlator.sums(*zip(a, b, strict=True))
-        power = np.maximum(correlator.sums((power_a, second.mask)), 0)
-        power = np.sqrt(power * np.maximum(correlator.sums((first.mask, power_b)), 0))
+        cross, *powers = correlator.all_sums(
+            list(zip(a, b, strict=True)), [(power_a, second.mask)], [(first.mask, power_b)]
+        )
+        power = np.sqrt(np.maximum(powers[0], 0) * np.maximum(powers[1], 0))
         usable = scored & (power > 1e-6 * np.maximum(power.max(), 1e-300))
         z = np.divide(cross, power, out=np.zeros_like(cross), where=usable) * np.sqrt(counts)
         total += _in_deviations(z, usable)
@@ -182,8 +196,10 @@ def turned_grid(grid: Grid, turn: int) -> Grid:
 
 def _in_deviations(values: Float64, use: Any) -> Float64:
     """Subtract the median and divide by the robust spread of the cells in use."""
-    if not use.any():
+    some = (slice(None, None, 2 if values.size > _MANY else 1),) * 2
+    known = values[some][use[some]]
+    if not known.size:
         return np.zeros_like(values)
-    middle = float(np.median(values[use]))
-    spread = MAD_TO_SIGMA * float(np.median(np.abs(values[use] - middle)))
+    middle = float(np.median(known))
+    spread = MAD_TO_SIGMA * float(np.median(np.abs(known - middle)))
     return (values - middle) / spread if spread > 0 else np.zeros_like(values)

@@ -36,6 +36,7 @@ def draw_figures(
     *,
     scene_seconds: float = 120.0,
     renderer: scene.Renderer | None = None,
+    claim: Callable[[int], bool] | None = None,
 ) -> tuple[Path, ...]:
     """Draw every figure that the registration has evidence for, as PNG files.
 
@@ -49,6 +50,8 @@ def draw_figures(
         Time allowed for the 3-D still, which is rendered in a child process; 0 leaves it out.
     renderer : scene.Renderer, optional
         That child process, where one has been started already (`scene.renderer`).
+    claim : callable, optional
+        ``claim(k)`` says whether to draw the k-th figure here: another process may have begun it.
 
     Returns
     -------
@@ -64,19 +67,23 @@ def draw_figures(
     for estimate in registration.estimates:
         jobs[f"scores_{estimate.method}"] = partial(evidence.draw_surface, estimate)
     if scene_seconds <= 0:
-        return tuple(_drawn(jobs, folder))
+        return tuple(_drawn(jobs, folder, claim))
     with ThreadPoolExecutor(1) as beside:  # its child works while the others are drawn here
         still = beside.submit(
             scene.draw_scene, registration, folder / "scene.png", scene_seconds, renderer
         )
-        written = _drawn(jobs, folder)
+        written = _drawn(jobs, folder, claim)
     return tuple(written + [path for path in (still.result(),) if path])
 
 
-def _drawn(jobs: Mapping[str, Callable[[], Any]], folder: Path) -> list[Path]:
+def _drawn(
+    jobs: Mapping[str, Callable[[], Any]], folder: Path, claim: Callable[[int], bool] | None
+) -> list[Path]:
     """Draw and save; a figure that fails is a warning in the log."""
     written = []
-    for name, draw in jobs.items():
+    for number, (name, draw) in enumerate(jobs.items()):
+        if claim is not None and not claim(number):
+            continue
         path = folder / f"{name}.png"
         try:
             figure = draw()

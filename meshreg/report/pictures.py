@@ -80,7 +80,7 @@ def encoded(picture: UInt8, limit: int, *, exact: bool = False) -> UInt8:
 
 def _webp(image: Any, **how: Any) -> bytes:
     file = io.BytesIO()
-    image.save(file, format="WEBP", **how)
+    image.save(file, format="WEBP", method=2, **how)  # half the time, one per cent larger
     return file.getvalue()
 
 

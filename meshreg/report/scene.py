@@ -26,9 +26,9 @@ _LOG = logging.getLogger("meshreg")
 _SIDE = 350  # grid points along the longer side
 
 # VTK itself: pyvista, which wraps it, takes a second to import.
-# The window is opened before there is anything to show, which takes as long as the rest.
+# A trial picture is made before there is anything to show: its shaders take longer than the rest.
 _CHILD = """
-import json, sys
+import json, os, sys
 import numpy as np
 import vtkmodules.vtkRenderingOpenGL2
 from vtkmodules.util.numpy_support import numpy_to_vtk, vtk_to_numpy
@@ -42,54 +42,64 @@ window = vtkRenderWindow()
 window.SetOffScreenRendering(True)
 window.SetSize(2000, 1000)
 window.SetMultiSamples(0)
-window.Render()
+
+def picture(data):
+    east, north = np.meshgrid(data["east"], data["north"])
+    lights, camera, ends, renderers = vtkLightKit(), vtkCamera(), [], []
+    camera.SetPosition(-0.45, -1.0, 0.9)
+    camera.SetViewUp(0, 0, 1)
+    for column, name in enumerate(("reference", "moving")):
+        height = data[name]
+        node = np.arange(height.size).reshape(height.shape)
+        corners = np.stack([node[:-1, :-1], node[:-1, 1:], node[1:, 1:], node[1:, :-1]], axis=-1)
+        seen = np.isfinite(height.ravel()[corners]).all(axis=-1)
+        used, corners = np.unique(corners[seen], return_inverse=True)
+        points = np.column_stack([x.ravel()[used] for x in (east, north, height)])
+        points[:, 2] *= data["exaggeration"]
+        place, faces, surface = vtkPoints(), vtkCellArray(), vtkPolyData()
+        place.SetData(numpy_to_vtk(points, deep=True))
+        faces.SetData(4, numpy_to_vtk(corners.ravel(), deep=True))
+        surface.SetPoints(place)
+        surface.SetPolys(faces)
+        colors = data[name + "_color"].reshape(-1, 3)[used]
+        surface.GetPointData().SetScalars(numpy_to_vtk(colors, deep=True))
+        mapper, actor, renderer = vtkPolyDataMapper(), vtkActor(), vtkRenderer()
+        mapper.SetInputData(surface)
+        actor.SetMapper(mapper)
+        actor.GetProperty().SetInterpolationToFlat()
+        actor.GetProperty().SetAmbient(0.25)
+        renderer.AddActor(actor)
+        renderer.SetBackground(1, 1, 1)
+        renderer.SetViewport(column / 2, 0, (column + 1) / 2, 1)
+        renderer.UseFXAAOn()
+        lights.AddLightsToRenderer(renderer)
+        renderer.SetActiveCamera(camera)
+        window.AddRenderer(renderer)
+        renderers.append(renderer)
+        if used.size:
+            ends += [points.min(axis=0), points.max(axis=0)]
+    lights.Update()
+    renderer.ResetCamera(np.column_stack([np.min(ends, axis=0), np.max(ends, axis=0)]).ravel())
+    reader = vtkWindowToImageFilter()
+    reader.SetInput(window)
+    reader.ReadFrontBufferOff()
+    reader.Update()
+    image = reader.GetOutput()
+    for renderer in renderers:
+        window.RemoveRenderer(renderer)
+    wide, tall, _ = image.GetDimensions()
+    return vtk_to_numpy(image.GetPointData().GetScalars()).reshape(tall, wide, 3)[::-1]
+
+square, grey = np.array([[0.0, 0.1], [0.0, 0.0]]), np.full((2, 2, 3), 128, np.uint8)
+trial = {"east": np.arange(2.0), "north": np.arange(2.0), "exaggeration": 1.0}
+trial |= {name: square for name in ("reference", "moving")}
+picture(trial | {name: grey for name in ("reference_color", "moving_color")})
 asked = sys.stdin.readline()
 if not asked:
-    sys.exit()
+    os._exit(0)
 source, target = json.loads(asked)
-data = dict(np.load(source))
-east, north = np.meshgrid(data["east"], data["north"])
-lights, camera, ends = vtkLightKit(), vtkCamera(), []
-camera.SetPosition(-0.45, -1.0, 0.9)
-camera.SetViewUp(0, 0, 1)
-for column, name in enumerate(("reference", "moving")):
-    height = data[name]
-    node = np.arange(height.size).reshape(height.shape)
-    corners = np.stack([node[:-1, :-1], node[:-1, 1:], node[1:, 1:], node[1:, :-1]], axis=-1)
-    seen = np.isfinite(height.ravel()[corners]).all(axis=-1)
-    used, corners = np.unique(corners[seen], return_inverse=True)
-    points = np.column_stack([x.ravel()[used] for x in (east, north, height)])
-    points[:, 2] *= data["exaggeration"]
-    place, faces, surface = vtkPoints(), vtkCellArray(), vtkPolyData()
-    place.SetData(numpy_to_vtk(points, deep=True))
-    faces.SetData(4, numpy_to_vtk(corners.ravel(), deep=True))
-    surface.SetPoints(place)
-    surface.SetPolys(faces)
-    colors = data[name + "_color"].reshape(-1, 3)[used]
-    surface.GetPointData().SetScalars(numpy_to_vtk(colors, deep=True))
-    mapper, actor, renderer = vtkPolyDataMapper(), vtkActor(), vtkRenderer()
-    mapper.SetInputData(surface)
-    actor.SetMapper(mapper)
-    actor.GetProperty().SetInterpolationToFlat()
-    actor.GetProperty().SetAmbient(0.25)
-    renderer.AddActor(actor)
-    renderer.SetBackground(1, 1, 1)
-    renderer.SetViewport(column / 2, 0, (column + 1) / 2, 1)
-    renderer.UseFXAAOn()
-    lights.AddLightsToRenderer(renderer)
-    renderer.SetActiveCamera(camera)
-    window.AddRenderer(renderer)
-    if used.size:
-        ends += [points.min(axis=0), points.max(axis=0)]
-lights.Update()
-renderer.ResetCamera(np.column_stack([np.min(ends, axis=0), np.max(ends, axis=0)]).ravel())
-reader = vtkWindowToImageFilter()
-reader.SetInput(window)
-reader.ReadFrontBufferOff()
-reader.Update()
-picture = reader.GetOutput()
-wide, tall, _ = picture.GetDimensions()
-np.save(target, vtk_to_numpy(picture.GetPointData().GetScalars()).reshape(tall, wide, 3)[::-1])
+np.save(target, picture(dict(np.load(source))))
+os._exit(0)  # VTK takes a tenth of a second to go
 """
 
 
