@@ -195,6 +195,32 @@ def test_same_seed_same_document():
     np.testing.assert_array_equal(runs[0].covariance, runs[1].covariance)
 
 
+@pytest.mark.parametrize("warp", ["none", "auto"])
+def test_the_transform_is_told_as_soon_as_it_stands(warp):
+    """Not where a warp may follow, nor for a pair that has none."""
+    floor, later = floors()
+    moving, _ = displaced(survey(later, seed=1))
+    told, stages = [], []
+    registration = register_pair(
+        survey(floor),
+        moving,
+        QUICK.changed({"warp.model": warp}),
+        settled=lambda transform: told.append((transform, stages[-1])),
+        progress=lambda stage, fraction: stages.append((stage, fraction)),
+    )
+    assert registration.transform is not None
+    if warp == "none":
+        ((transform, when),) = told
+        assert transform is registration.transform
+        assert when[0] == "refine"
+    else:
+        assert not told
+    apart = apply_transform(moving, Transform(offset=[5000.0, 0.0, 0.0]))
+    rejected = register_pair(survey(floor), apart, QUICK, settled=told.append)
+    assert rejected.transform is None
+    assert len(told) == (warp == "none")
+
+
 def test_misuse_names_the_remedy():
     reference = survey(floors()[0], half=2.0)
     other_crs = dataclasses.replace(reference, crs="EPSG:32755")
