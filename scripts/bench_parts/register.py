@@ -2,8 +2,8 @@
 
 The demonstration's two meshes have 14 k triangles; it is run twice in one process, and the second
 run counts. The made pair has 2 M triangles and texels of 5 mm each; there it is the command that
-counts, with its start, its checks and all files written, and `beyond reading` is all but `read`.
-Its files are made once (minutes) and kept in the folder for temporary files.
+counts, with its start, its checks and all files written, and `beyond reading` is all but `read`;
+of five runs the one that is the median beyond reading. Its files are made once (minutes) and kept in the folder for temporary files.
 """
 
 from __future__ import annotations
@@ -98,7 +98,9 @@ def command(folder: str) -> dict[str, Any]:
 
 
 def bench() -> list[dict[str, Any]]:
-    small, large = apart("register", "job"), apart("register", "command", str(made_pair()))
+    small, folder = apart("register", "job"), str(made_pair())
+    runs = [apart("register", "command", folder) for _ in range(5)]
+    large = sorted(runs, key=lambda run: run["seconds"] - run["stages"]["read"])[2]
     names = ("demo", "25 m, 2 M faces")
     columns = [small["stages"], large["stages"]]
 
