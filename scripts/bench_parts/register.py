@@ -3,7 +3,8 @@
 The demonstration's two meshes have 14 k triangles; it is run twice in one process, and the second
 run counts. The made pair has 2 M triangles and texels of 5 mm each; there it is the command that
 counts, with its start, its checks and all files written, and `beyond reading` is all but `read`;
-of five runs the one that is the median beyond reading. Its files are made once (minutes) and kept in the folder for temporary files.
+of five runs the one that is the median beyond reading. Its files are made once (minutes) and kept
+in the folder for temporary files.
 """
 
 from __future__ import annotations
