@@ -164,7 +164,8 @@ def over_ground(tiles: TileOffsets, ground: Ground, pivot: Float64) -> Refined:
 
     The ground counts as the reference sees it: where the models stretch, so do its cells. It might
     as well count as the moving survey sees it, which is what the same pair the other way round will
-    do: half of what that changes is added to the doubt.
+    do: half of what that changes is added to the doubt. So is all that changes where the tiles that
+    were left out are not: what counts as ground that has not changed is a choice.
     """
     places, offsets = tiles.places, tiles.offsets
     motion = best_motion(places, offsets, ground, pivot, yaw_free=True)
@@ -172,14 +173,16 @@ def over_ground(tiles: TileOffsets, ground: Ground, pivot: Float64) -> Refined:
     share = ground.share * np.clip(motion.field.growth(ground.places), 0.5, 2.0)
     ground = replace(ground, share=share / share.sum())
     motion = best_motion(places, offsets, ground, pivot, yaw_free=True, start=motion)
-    half = 0.5 * (motion.answer - either)
+    all_told = replace(motion, used=np.ones(len(places), bool))
+    everything = best_motion(places, offsets, ground, pivot, yaw_free=True, start=all_told)
+    half, choice = 0.5 * (motion.answer - either), everything.answer - motion.answer
     covariance, yaw = motion.covariance, float(motion.answer[2])
     offset = motion.answer[:2]
     if abs(yaw) <= 2 * np.sqrt(covariance[2, 2]):
         still = best_motion(places, offsets, ground, pivot, yaw_free=False, start=motion)
         yaw, offset = 0.0, still.answer
         covariance = _block_diagonal(still.covariance, covariance[2, 2])
-    covariance = misfit(tiles) * covariance + np.outer(half, half)
+    covariance = misfit(tiles) * covariance + np.outer(half, half) + np.outer(choice, choice)
     used = motion.used.astype(np.float64)
     answer = Refined(pivot, offset, yaw, covariance, tiles, weights=used, offset_at=motion.field)
     return _with_residuals(answer)
