@@ -22,8 +22,8 @@ RANGES = (0.1, 0.2, 0.4, 0.8, 1.6)  # of the warp, in diagonals of the tiles' pl
 # relief that tells its offset is spread unevenly over it, and the warp bends within it.
 SHARES = (0.0, 0.2, 0.5, 0.8, 0.95, 0.99)
 MOST_TILES = 300  # that the warp's size and range are estimated from
-# Squared deviations of two axes, from what all others say. Chance would be content with half of
-# that; but a warp bends more in some places than as a rule, and ground that slid stands out by more.
+# Squared deviations of two axes, from what all others say. Chance would be content with half; but a
+# warp bends more in some places than as a rule, and ground that slid stands out by more than that.
 OUTLIER = 40.0
 
 

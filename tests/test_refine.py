@@ -262,6 +262,62 @@ def test_there_and_back_is_nothing_within_three_sigmas(size):
     assert np.median(largest) > 0.2
 
 
+def rim(seed, bend):
+    """Tiles that wave by 3 cm, and bend by `bend` [m] more towards the northern rim.
+
+    Also the uniform best fit: east and north [m] at the ground's centroid, turn.
+    """
+    there, _, rng = bent(seed, 0.03)
+
+    def offset(places):
+        north = np.clip(places[:, 1] - 4.0, 0, None) / 5.0
+        return there(places) + bend * north[:, None] ** 2 * (0.8, -0.6)
+
+    axis = np.linspace(-8, 8, 8)
+    places = np.stack([a.ravel() for a in np.meshgrid(axis, axis)], axis=1)
+    offsets = offset(places) + rng.normal(0, 0.003, places.shape)
+    tiles = TileOffsets(places, offsets, np.arange(64), np.zeros(64, int))
+    dense = np.stack([a.ravel() for a in np.meshgrid(*[np.arange(-8.95, 9, 0.1)] * 2)], axis=1)
+    x, y = dense.T
+    one, none = np.ones_like(x), np.zeros_like(x)
+    design = np.concatenate([np.stack([one, none, -y], 1), np.stack([none, one, x], 1)])
+    best = np.linalg.lstsq(design, offset(dense).T.ravel(), rcond=None)[0]
+    return tiles, uniform_ground(lambda p: np.abs(p).max(axis=1) < 9), best
+
+
+def missed(tiles, ground, best):
+    """Metres from the best fit, the same in sigmas, the sigma of east [m]."""
+    found = over_ground(tiles, ground, np.zeros(2))
+    miss, covariance = found.offset - best[:2], found.covariance[:2, :2]
+    sigmas = np.sqrt(miss @ np.linalg.solve(covariance, miss))
+    return float(np.hypot(*miss)), float(sigmas), float(np.sqrt(covariance[0, 0]))
+
+
+def test_a_rim_that_bends_more_than_the_rest_counts_as_much():
+    """Left out as if it had slid, it would move the answer by 2 mm in the median, not by 0.6."""
+    away, sigmas, _ = np.array([missed(*rim(seed, 0.15)) for seed in range(16)]).T
+    assert np.median(away) < 0.001
+    assert away.max() < 0.012
+    assert 0.3 < sigmas.max() < 3.0
+
+
+def test_what_leaving_ground_out_changes_is_in_the_error_bar():
+    """A corner slid by 40 cm: it hardly pulls, but it might have been the models that bent."""
+    rows = []
+    for seed in range(16):
+        tiles, ground, best = rim(seed, 0.0)
+        slid = (tiles.places > 3.0).all(axis=1)
+        offsets = tiles.offsets + np.where(slid[:, None], (0.4, 0.0), 0.0)
+        rows.append(missed(dataclasses.replace(tiles, offsets=offsets), ground, best))
+        assert missed(tiles, ground, best)[2] < 0.002
+    away, sigmas, east = np.array(rows).T
+    pulled = 0.4 * slid.mean()
+    assert np.median(away) < 0.1 * pulled
+    assert away.max() < pulled
+    assert sigmas.max() < 4.0
+    assert 0.5 * pulled < np.median(east) < 1.5 * pulled
+
+
 def test_small_tiles_are_trusted_less():
     tiles = TileOffsets(np.zeros((1, 2)), np.zeros((1, 2)), np.zeros(1, int), np.zeros(1, int))
     sides = [16, 24, 36, 100, 128]
