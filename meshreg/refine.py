@@ -26,9 +26,9 @@ LEAST_FOR_SCALE = 12  # tiles, for a scale of their own
 UNKNOWN_SCALE = 0.01 / 3  # sigma: beyond 1 % a scale is plainly wrong, and found before (`voting`)
 NODES = 20  # along the overlap's side
 # Kriging takes the warp to be smooth and the tiles to err independently; small tiles, with few
-# details each, do so less. The variance is larger by the root of HONEST_SIDE over the cells along
-# a tile's side. Measured on synthetic pairs of 12 to 25 m (coverage of the stated region).
-HONEST_SIDE = 100
+# details each, do so less. The variance is larger by HONEST_SIDE over the cells along a tile's
+# side. Measured on synthetic pairs of 12 to 25 m (coverage of the stated region).
+HONEST_SIDE = 45
 # Cells: what sampling alone leaves open, alike for all tiles, so that their scatter does not show
 # it; for peaks of correlation (a parabola through whole cells leans towards them), and polished.
 PEAK_RESOLUTION, RESOLUTION = 0.05, 0.005
@@ -136,7 +136,7 @@ def _stated(refined: Refined, resolution: float) -> Refined:
 
 def misfit(tiles: TileOffsets) -> float:
     """By how much the variance is larger than the tiles' scatter tells."""
-    return max(1.0, float(np.sqrt(HONEST_SIDE / tiles.side)))
+    return max(1.0, HONEST_SIDE / tiles.side)
 
 
 def _polished(

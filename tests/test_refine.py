@@ -323,7 +323,8 @@ def test_small_tiles_are_trusted_less():
     sides = [16, 24, 36, 100, 128]
     found = [misfit(dataclasses.replace(tiles, side=side)) for side in sides]
     assert found == sorted(found, reverse=True)
-    assert found[0] == pytest.approx(2.5)
+    assert found[0] == pytest.approx(2.8125)
+    assert found[2] == pytest.approx(1.25)
     assert found[3:] == [1.0, 1.0]
 
 
