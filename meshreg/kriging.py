@@ -22,9 +22,10 @@ RANGES = (0.1, 0.2, 0.4, 0.8, 1.6)  # of the warp, in diagonals of the tiles' pl
 # relief that tells its offset is spread unevenly over it, and the warp bends within it.
 SHARES = (0.0, 0.2, 0.5, 0.8, 0.95, 0.99)
 MOST_TILES = 300  # that the warp's size and range are estimated from
-# Squared deviations of two axes, from what all others say. Chance would be content with half; but a
-# warp bends more in some places than as a rule, and ground that slid stands out by more than that.
-OUTLIER = 40.0
+# Squared deviations of two axes, from what all others say, at which a tile is left out, and up to
+# which it comes back: two numbers, lest it go in and out. Chance would be content with half (1e-4),
+# but a warp bends more in some places than as a rule, and ground that slid stands out by more.
+OUTLIER, RETURN = 40.0, 30.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -289,13 +290,14 @@ def _fitting(fit: _Fit, places: Float64, offsets: Float64, used: Bool, pivot: Fl
         expected += near @ alone
         variance = 1.0 - ((near @ fit.inverse) * near).sum(axis=1)
         away = ((offsets[out] - expected) ** 2).sum(axis=1)
-        result[out] = away <= OUTLIER * scale * fit.variance * np.maximum(variance, 1e-12)
+        result[out] = away <= RETURN * scale * fit.variance * np.maximum(variance, 1e-12)
     return result if result.sum() >= 0.5 * used.sum() else used
 
 
 def _near_neighbours(places: Float64, offsets: Float64) -> Bool:
     """Tell which tiles lie near the median of their eight neighbours: a start without outliers."""
     away = ((places[:, None] - places[None]) ** 2).sum(axis=2)
+    away = np.round(away / max(float(away.max()), 1e-30), 9)  # rounding decides among no equals
     nearest = np.argsort(away, axis=1, kind="stable")[:, 1:9]
     apart = np.hypot(*(offsets - np.median(offsets[nearest], axis=1)).T)
     return np.asarray(apart <= 4 * max(float(np.median(apart)), 1e-9))
