@@ -173,8 +173,10 @@ def over_ground(tiles: TileOffsets, ground: Ground, pivot: Float64) -> Refined:
     share = ground.share * np.clip(motion.field.growth(ground.places), 0.5, 2.0)
     ground = replace(ground, share=share / share.sum())
     motion = best_motion(places, offsets, ground, pivot, yaw_free=True, start=motion)
-    all_told = replace(motion, used=np.ones(len(places), bool))
-    everything = best_motion(places, offsets, ground, pivot, yaw_free=True, start=all_told)
+    everything = motion
+    if not motion.used.all():
+        everything = replace(motion, used=np.ones(len(places), bool))
+        everything = best_motion(places, offsets, ground, pivot, yaw_free=True, start=everything)
     half, choice = 0.5 * (motion.answer - either), everything.answer - motion.answer
     covariance, yaw = motion.covariance, float(motion.answer[2])
     offset = motion.answer[:2]

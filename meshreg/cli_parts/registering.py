@@ -70,7 +70,7 @@ def register_into(folder: Path, request: RegisterRequest, progress: Progress) ->
 
     _log_start(request)
     with (
-        draughtsman(request.reference.path, request.moving.path) as draw,
+        draughtsman(request.reference.path, request.moving.path) as begin,
         ThreadPoolExecutor(1) as beside,
     ):
         # not before: cv2 changes sys.path while it is imported, and the new process gets a copy
@@ -121,7 +121,7 @@ def register_into(folder: Path, request: RegisterRequest, progress: Progress) ->
         )
         _log_result(registration)
         progress("write", 0.0)
-        finish = draw(registration, folder / "figures")
+        finish = begin(registration, folder / "figures")
         write_record_files(
             registration,
             folder,
