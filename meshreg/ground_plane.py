@@ -84,14 +84,17 @@ class GroundPlane:
         """Covariance (3, 3) of the step; `sheet` [m] is what ground may do that nothing tells of.
 
         The bending's mean over all ground belongs to up; only what departs from the neighbours
-        makes that err. A tilt hangs on the rim, and with it on how the models bend there.
+        makes that err. A tilt hangs on the rim, and with it on how the models bend there. What
+        covers the ground is one-sided (turf and crusts add, wear takes away), and no height
+        difference tells its mean from up: what covers half the ground has a mean as large as its
+        spread, and blocks show that spread.
         """
         covariance, alone = self._sandwich(self.depart), self._sandwich(self.noise)
         if covariance[0, 0] > alone[0, 0]:
             less = np.sqrt(alone[0, 0] / covariance[0, 0])
             covariance[0] *= less
             covariance[:, 0] *= less
-        covariance[0, 0] += self.choice**2
+        covariance[0, 0] += max(self.choice**2, self.sigma**2)
         return covariance + self._hidden(sheet)
 
     def tells(self, tilt: Float64, sheet: float = 0.0) -> bool:

@@ -130,7 +130,9 @@ def fit_heights(
     at least two correlation lengths of these departures wide: the slow bending itself moves the
     best fit over all ground as much as this one. Added to the variance of `up` is the square of how
     much it changes if nothing is left out (median of all cells: when much has changed, what counts
-    as stable ground is a choice); to both, what the bending may do where no ground counts.
+    as stable ground is a choice) or, where that is more, of `sigma` (growth that covers half of the
+    ground lifts it as a whole by as much as it makes its parts differ); to both, what the bending
+    may do where no ground counts.
 
     Parameters
     ----------
