@@ -34,52 +34,45 @@ def page_spans(uv: Float32, face_page: Int32, n_pages: int) -> Float64:
     return spans
 
 
-@jit(parallel=True, nogil=True)
+@jit(parallel=True, nogil=True, error_model="numpy")
 def covered(uv: Float32, face_page: Int32, page: int, size: tuple[int, int], workers: int) -> UInt8:
     """Set to 1 the texels of a page of `size` (height, width) that its faces touch.
 
-    Each worker looks at all faces and keeps to its own stripe of rows.
+    Two workers may set one texel; both set it to the same.
     """
     height, width = size
     used = np.zeros((height, width), np.uint8)
+    n_faces = face_page.shape[0]
     for worker in prange(workers):
-        top_row, end_row = worker * height // workers, (worker + 1) * height // workers
-        x = np.empty(3, np.float64)
-        y = np.empty(3, np.float64)
-        for f in range(face_page.shape[0]):
+        for f in range(worker * n_faces // workers, (worker + 1) * n_faces // workers):
             if face_page[f] != page:
                 continue
-            for k in range(3):
-                y[k] = (1.0 - uv[f, k, 1]) * height
-            first = max(math.floor(min(y[0], y[1], y[2])), top_row)
-            last = min(math.floor(max(y[0], y[1], y[2])), end_row - 1)
-            if first > last:
-                continue
-            for k in range(3):
-                x[k] = uv[f, k, 0] * width
-            for row in range(first, last + 1):
-                west, east = _span_in_row(x, y, float(row))
+            x0, x1, x2 = uv[f, 0, 0] * width, uv[f, 1, 0] * width, uv[f, 2, 0] * width
+            y0 = (1.0 - uv[f, 0, 1]) * height
+            y1 = (1.0 - uv[f, 1, 1]) * height
+            y2 = (1.0 - uv[f, 2, 1]) * height
+            if y0 > y1:
+                x0, y0, x1, y1 = x1, y1, x0, y0
+            if y1 > y2:
+                x1, y1, x2, y2 = x2, y2, x1, y1
+            if y0 > y1:
+                x0, y0, x1, y1 = x1, y1, x0, y0
+            whole = (x2 - x0) / (y2 - y0) if y2 > y0 else 0.0
+            upper = (x1 - x0) / (y1 - y0) if y1 > y0 else 0.0
+            lower = (x2 - x1) / (y2 - y1) if y2 > y1 else 0.0
+            for row in range(max(math.floor(y0), 0), min(math.floor(y2), height - 1) + 1):
+                top, bottom = max(y0, float(row)), min(y2, row + 1.0)
+                a, b = x0 + (top - y0) * whole, x0 + (bottom - y0) * whole
+                c = x0 + (top - y0) * upper if top < y1 else x1 + (top - y1) * lower
+                d = x0 + (bottom - y0) * upper if bottom < y1 else x1 + (bottom - y1) * lower
+                west, east = min(a, b, c, d), max(a, b, c, d)
+                if top <= y1 <= bottom:
+                    west, east = min(west, x1), max(east, x1)
+                if y2 == y0:  # level: the others do not reach its third corner
+                    west, east = min(west, x2), max(east, x2)
                 for col in range(max(math.floor(west), 0), min(math.floor(east), width - 1) + 1):
                     used[row, col] = 1
     return used
-
-
-@jit(nogil=True)
-def _span_in_row(x: Float64, y: Float64, row: float) -> tuple[float, float]:
-    """From where to where a triangle reaches between y = row and row + 1; infinite: nowhere."""
-    west, east = np.inf, -np.inf
-    for k in range(3):
-        m = (k + 1) % 3
-        ax, ay, bx, by = x[k], y[k], x[m], y[m]
-        if ay > by:
-            ax, ay, bx, by = bx, by, ax, ay
-        top, bottom = max(ay, row), min(by, row + 1.0)
-        if top <= bottom:  # this edge passes here
-            slope = (bx - ax) / (by - ay) if by > ay else 0.0
-            one = ax + (top - ay) * slope
-            two = ax + (bottom - ay) * slope if by > ay else bx
-            west, east = min(west, one, two), max(east, one, two)
-    return west, east
 
 
 @jit(parallel=True, nogil=True)

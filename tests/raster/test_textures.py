@@ -7,6 +7,8 @@ import logging
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from reference_raster import draped, grid_faces, mesh_raster, page, sheet
 
 from meshreg.errors import InputError
@@ -304,3 +306,33 @@ def test_a_mesh_without_any_color_says_so():
     assert raster.valid.all()
     assert not raster.color_valid.any()
     assert not raster.color.any()
+
+
+def touched(corners, size, by):
+    """Texels, wider by `by`, that a triangle touches: by separating axes, slow and plain."""
+    row, col = np.indices(size)
+    rims = -by, 1 + by
+    square = np.stack(
+        [np.stack([col + dx, row + dy], axis=-1) for dx in rims for dy in rims], axis=-2
+    )
+    edges = np.roll(corners, -1, axis=0) - corners
+    axes = [*np.stack([-edges[:, 1], edges[:, 0]], axis=1), np.array([1, 0]), np.array([0, 1])]
+    meets = np.ones(size, bool)
+    for axis in axes:
+        mine, theirs = corners @ axis, square @ axis
+        meets &= (theirs.max(axis=-1) >= mine.min()) & (theirs.min(axis=-1) <= mine.max())
+    return meets
+
+
+@given(st.lists(st.floats(-0.2, 1.2), min_size=6, max_size=6), st.integers(1, 3))
+def test_texels_that_a_face_touches_are_those_that_no_axis_separates(numbers, workers):
+    from meshreg.raster.page_kernels import covered
+
+    size = 9, 7
+    uv = np.array(numbers, np.float32).reshape(1, 3, 2)
+    corners = np.stack([uv[0, :, 0] * 7.0, (1.0 - uv[0, :, 1]) * 9.0], axis=1).astype(float)
+    elsewhere = np.float32([[[0, 0], [1, 0], [0, 1]]])
+    found = covered(np.concatenate([elsewhere, uv]), np.int32([1, 0]), 0, size, workers)
+    # a face that just reaches a texel's rim may round either way
+    assert np.all(touched(corners, size, -1e-4) <= found)
+    assert np.all(found <= touched(corners, size, 1e-4))
