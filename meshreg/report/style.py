@@ -47,10 +47,14 @@ def new_figure(
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
+    from matplotlib.layout_engine import TightLayoutEngine
 
     scale = min(1.0, MAX_PIXELS / DPI / max(width, height))
     figure = Figure(
-        figsize=(width * scale, height * scale), dpi=DPI, layout="constrained" if bars else "tight"
+        figsize=(width * scale, height * scale),
+        dpi=DPI,
+        # without a rectangle it measures all labels once, not twice, and comes to the same
+        layout="constrained" if bars else TightLayoutEngine(rect=None),  # type: ignore[arg-type]
     )
     FigureCanvasAgg(figure)
     figure.suptitle(title, fontsize=12, fontweight="bold", color=INK)
