@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
 from meshreg.ground import Index, recurring
-from meshreg.types import Bool, Float64, SurveyRaster, Transform
+from meshreg.types import Bool, Float64, OffsetAt, SurveyRaster, Transform
 
 LEAST_RECURRING = 0.1  # share of the common cells; with less, all of them are asked
 BEND_STEP = 8  # cells between the places at which the bending is computed
-OffsetAt = Callable[[Float64], Float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,8 +11,7 @@ import numpy as np
 from meshreg.judge import Judgement
 from meshreg.refine import Refined
 from meshreg.settings import SearchSettings
-from meshreg.tiles import Guess
-from meshreg.types import Float64, SurveyRaster, Transform
+from meshreg.types import Float64, OffsetAt, SurveyRaster, Transform
 from meshreg.voting import SMALL_YAW, Turn, vote
 
 Pairs = dict[str, tuple[SurveyRaster, SurveyRaster]]
@@ -119,7 +118,7 @@ def as_delivered(refined: Refined, motion: Transform) -> Refined:
     )
 
 
-def _offset_at(turned: Guess, motion: Transform, places: Float64) -> Float64:
+def _offset_at(turned: OffsetAt, motion: Transform, places: Float64) -> Float64:
     """Offset (N, 2) [m] of places as delivered, from that of the turned ones."""
     points = np.column_stack([places, np.full(len(places), motion.pivot[2])])
     there = motion.apply(points)[:, :2]

@@ -12,10 +12,10 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from meshreg.dem_pair import DemPair, OffsetAt, points_of
+from meshreg.dem_pair import DemPair, points_of
 from meshreg.ground import MAD_TO_SIGMA
 from meshreg.ground_plane import CHANGED, SET_ASIDE, STABLE, UNKNOWN, GroundPlane, fit_plane
-from meshreg.types import Float64, Grid, SurveyRaster, Transform, UInt8, Warp
+from meshreg.types import Float64, Grid, OffsetAt, SurveyRaster, Transform, UInt8, Warp
 
 __all__ = [
     "CHANGED",

@@ -18,8 +18,8 @@ from meshreg.kriging import Ground, best_motion, design, overlap_ground
 from meshreg.offsets import neutral
 from meshreg.offsets.surface import MAD_TO_SIGMA
 from meshreg.sandwich import block_sandwich
-from meshreg.tiles import MAX_YAW, Guess, Relief, TileOffsets, correlated_tiles, polished_tiles
-from meshreg.types import Float64, SurveyRaster
+from meshreg.tiles import MAX_YAW, Relief, TileOffsets, correlated_tiles, polished_tiles
+from meshreg.types import Float64, OffsetAt, SurveyRaster
 
 MIN_TILES = 6
 LEAST_FOR_SCALE = 12  # tiles, for a scale of their own
@@ -72,7 +72,7 @@ class Refined:
     note: str = ""
     doubt: str = ""
     scale_variance: float = 0.0
-    offset_at: Guess | None = None
+    offset_at: OffsetAt | None = None
 
 
 def refine(
@@ -144,7 +144,7 @@ def _polished(
 ) -> Refined | None:
     """Polish the tiles from the rigid answer, and again from what they say, until it stays."""
     still, moved, offset = Relief.of(reference), Relief.of(moving), start.offset
-    guess: Guess = partial(_rigid, start)
+    guess: OffsetAt = partial(_rigid, start)
     for _ in range(4):
         tiles = polished_tiles(still, moved, offset, guess)
         if not _enough(tiles):

@@ -8,7 +8,6 @@ horizontal warp of the models from bending a single global fit toward where they
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
@@ -19,11 +18,10 @@ from meshreg.offsets import correlate, neutral
 from meshreg.offsets.channels import high_pass
 from meshreg.offsets.correlate import Correlator, Window
 from meshreg.offsets.surface import find_peak
-from meshreg.types import Bool, Float64, Grid, SurveyRaster
+from meshreg.types import Bool, Float64, Grid, OffsetAt, SurveyRaster
 
 MAX_YAW = np.deg2rad(1.0)
 HIGH_PASS = 2.0  # cells: finer than any warp, coarser than the noise of single cells
-Guess = Callable[[Float64], Float64]
 TILE_CELLS = 36  # at most; on small patches at least 7 tiles a side as long as they hold 16 cells
 
 
@@ -165,7 +163,7 @@ def _correlate_tile(
 
 
 def polished_tiles(
-    reference: Relief, moving: Relief, offset: Float64, guess: Guess
+    reference: Relief, moving: Relief, offset: Float64, guess: OffsetAt
 ) -> TileOffsets | None:
     """Read each tile's offset by robust Gauss-Newton on high-passed heights.
 
@@ -236,7 +234,7 @@ class _Bend:
     nodes: Float64  # (2, R, C): spline coefficients of east and north [m]
 
     @classmethod
-    def of(cls, guess: Guess, grid: Grid, side: int) -> _Bend:
+    def of(cls, guess: OffsetAt, grid: Grid, side: int) -> _Bend:
         from scipy.ndimage import spline_filter
 
         step = max(side // 4, 1)

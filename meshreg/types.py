@@ -26,6 +26,8 @@ UInt8 = NDArray[np.uint8]
 Bool = NDArray[np.bool_]
 Status = Literal["ok", "weak", "failed"]
 Verdict = Literal["accepted", "review", "rejected"]
+# of places (N, 2): how far the ground there must go [m], (N, 2)
+OffsetAt = Callable[[Float64], Float64]
 
 _NOTHING: Mapping[str, Any] = MappingProxyType({})
 
