@@ -8,6 +8,7 @@ one for each cell.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -89,7 +90,7 @@ class GroundPlane:
         difference tells its mean from up: what covers half the ground has a mean as large as its
         spread, and blocks show that spread.
         """
-        covariance, alone = self._sandwich(self.depart), self._sandwich(self.noise)
+        covariance, alone = self._bending.copy(), self._sandwich(self.noise)
         if covariance[0, 0] > alone[0, 0]:
             less = np.sqrt(alone[0, 0] / covariance[0, 0])
             covariance[0] *= less
@@ -105,8 +106,12 @@ class GroundPlane:
             return False
         freedom = max(int(self._parcels(self.depart).max()) - 2, 1)  # parcels may be few
         limit = 2 * (freedom + 1) / freedom * float(fdtri(2, freedom, 0.9973))
-        covariance = (self._sandwich(self.depart) + self._hidden(sheet))[1:, 1:]
+        covariance = (self._bending + self._hidden(sheet))[1:, 1:]
         return bool(tilt @ np.linalg.pinv(covariance, hermitian=True) @ tilt > limit)
+
+    @cached_property
+    def _bending(self) -> Float64:
+        return self._sandwich(self.depart)
 
     def _hidden(self, sheet: float) -> Float64:
         return (self.unseen**2 + sheet**2) * self.leverage
