@@ -4,9 +4,8 @@
     scripts/error_bar.py pairs.jsonl [--size 25] [--pairs 110] [--seed 47]
 
 Grounds, intervals and draws are those of `meshreg benchmark`. DEM cells of 0.10 m, orthomosaic
-0.05 m, the methods terrain and mutual information: SIFT proposes an offset like the others, and the
-refined one with its error bar does not depend on who proposed. Every tenth pair is registered the
-other way round too. Each pair is a line of the file; what is there already is not done again.
+0.05 m, the methods terrain and mutual information: SIFT takes the most time, and only proposes an
+offset, as they do. Every tenth pair is registered the other way round too. Each pair is a line of the file; what is there already is not done again.
 """
 
 from __future__ import annotations
