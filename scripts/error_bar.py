@@ -5,7 +5,8 @@
 
 Grounds, intervals and draws are those of `meshreg benchmark`. DEM cells of 0.10 m, orthomosaic
 0.05 m, the methods terrain and mutual information: SIFT takes the most time, and only proposes an
-offset, as they do. Every tenth pair is registered the other way round too. Each pair is a line of the file; what is there already is not done again.
+offset, as they do. Every tenth pair is registered the other way round too. Each pair is a line of
+the file; what is there already is not done again.
 """
 
 from __future__ import annotations
