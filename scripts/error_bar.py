@@ -13,10 +13,8 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import sys
-from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +22,6 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT), str(ROOT / "scripts" / "bench_parts")]
 METHODS = ("terrain", "mutual_information")
 NEVER = "sand_24mo"  # nothing is left there to be known again, and no pair is accepted
-NORMAL_95 = 1.959964
 BACK = 10  # each such pair is turned round
 
 
@@ -33,7 +30,7 @@ def one(job: Any) -> dict[str, Any]:
     from accuracy import there_and_back
 
     from data_synth.rasters import make_rasters
-    from meshreg.benchmark.measure import of_decision, register_rasters
+    from meshreg.benchmark.measure import NORMAL_95, of_decision, register_rasters
     from meshreg.benchmark.plan import recipe_of, settings_of
 
     made = make_rasters(recipe_of(job), job.seed, job.size, 0.10, 0.05, 0.05)
@@ -45,11 +42,12 @@ def one(job: Any) -> dict[str, Any]:
     decision = register_rasters(pairs, settings)
     rows = of_decision(decision, "robust", made.truth, None)
     fused = next(row for row in rows if row["method"] == "fused")
-    wanted = ("verdict", "success", "error", "distance2", "covered", "error_up", "sigma_up")
+    wanted = ("verdict", "success", "error", "covered", "error_up", "sigma_up", "covered_up")
     found = {"name": job.name, "kind": job.scenario} | {key: fused.get(key) for key in wanted}
     if decision.refined is not None:
         found["error_yaw"] = float(decision.refined.yaw - made.truth["yaw"])
         found["sigma_yaw"] = float(decision.refined.covariance[2, 2] ** 0.5)
+        found["covered_yaw"] = abs(found["error_yaw"]) <= NORMAL_95 * found["sigma_yaw"]
     if job.index % BACK == 2:
         turned = {name: (moving, reference) for name, (reference, moving) in pairs.items()}
         found["back"] = there_and_back(decision, register_rasters(turned, settings))
@@ -65,16 +63,15 @@ def crossed(size: float, pairs: int, seed: int) -> list[Any]:
     return [job for job in first if job.kind == "crossing"]
 
 
-def share(held: list[bool]) -> str:
-    """Count, share and its bounds (Clopper and Pearson)."""
-    from scipy.stats import beta
+def share(held: Iterable[bool]) -> str:
+    """Count, share and its bounds."""
+    from meshreg.benchmark.tables import rate
 
-    k, n = sum(held), len(held)
-    if not n:
+    found = rate(held)
+    if not found["total"]:
         return "–"
-    low = beta.ppf(0.025, k, n - k + 1) if k else 0.0
-    high = beta.ppf(0.975, k + 1, n - k) if k < n else 1.0
-    return f"{k} of {n}, {k / n:.1%} ({100 * low:.1f} to {100 * high:.1f})"
+    low, high = 100 * found["low"], 100 * found["high"]
+    return f"{found['count']} of {found['total']}, {found['rate']:.1%} ({low:.1f} to {high:.1f})"
 
 
 def table(rows: list[dict[str, Any]]) -> Iterator[str]:
@@ -90,10 +87,8 @@ def table(rows: list[dict[str, Any]]) -> Iterator[str]:
         those = [r for r in accepted if r["kind"].endswith("_" + interval)]
         groups.append((f"all after {interval}", those))
     for name, those in [*groups, ("all", accepted)]:
-        offset = [bool(r["covered"]) for r in those]
-        height = [abs(r["error_up"]) <= NORMAL_95 * r["sigma_up"] for r in those]
-        yaw = [abs(r["error_yaw"]) <= NORMAL_95 * r["sigma_yaw"] for r in those]
-        yield f"| {name} | {share(offset)} | {share(height)} | {share(yaw)} |"
+        held = [share(r[key] for r in those) for key in ("covered", "covered_up", "covered_yaw")]
+        yield f"| {name} | {' | '.join(held)} |"
     error, up, yaw = (
         np.abs([r[key] for r in accepted]) for key in ("error", "error_up", "error_yaw")
     )
@@ -117,16 +112,17 @@ def main() -> None:
     asked.add_argument("--seed", type=int, default=47)
     asked.add_argument("--workers", type=int, default=2)
     said = asked.parse_args()
+
+    from meshreg.benchmark.workers import run_all
+
     file: Path = said.file
     rows = [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []
     known = {row["name"] for row in rows}
     lot = [job for job in crossed(said.size, said.pairs, said.seed) if job.name not in known]
-    for library in ("NUMBA", "OMP", "OPENBLAS"):  # one thread each: the pairs are the threads
-        os.environ[f"{library}_NUM_THREADS"] = "1"
-    with ProcessPoolExecutor(said.workers) as pool, file.open("a") as out:
-        for done in as_completed([pool.submit(one, job) for job in lot]):
-            rows.append(done.result())
-            out.write(json.dumps(rows[-1], default=float) + "\n")
+    with file.open("a") as out:
+        for _, row in run_all(one, lot, said.workers):
+            rows.append(row)
+            out.write(json.dumps(row, default=float) + "\n")
             out.flush()
             print(f"\r{len(rows)} pairs", end="", file=sys.stderr)
     print("\n".join(table(rows)))

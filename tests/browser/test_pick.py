@@ -399,8 +399,7 @@ def test_two_windows_do_not_harm_the_file(
         for side, points in known.items():
             point = getattr(pair_, side)
             if point is not None:
-                # clicks fall on whole pixels of the window, between which the map may begin
-                assert np.abs(points - point).max(axis=1).min() < pixel
+                assert np.abs(points - point).max(axis=1).min() < 0.55 * pixel
     for page in (first, second):  # each shows what is in the file
         shown = page.evaluate("meshregPick.state().pairs.map((pair) => pair.id)")
         assert shown == [pair_.id for pair_ in found.pairs]
