@@ -1,123 +1,219 @@
 """Every number that a user may change: one frozen dataclass a stage, in metres.
 
-`robust` is the default preset; `paper` is Bryson et al. (IROS 2013) as published.
+`robust` is the default preset; `paper` is Bryson et al. (IROS 2013) as published. Each setting has
+its range beside it (`meshreg.checked`); after a change run `scripts/settings_table`.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
+from meshreg.checked import (
+    Checked,
+    Limits,
+    check,
+    choice,
+    flag,
+    listed,
+    number,
+    parse_toml,
+    read_toml,
+    shown,
+    wanted,
+)
 from meshreg.errors import UsageError
 
 Preset = Literal["robust", "paper"]
+PRESETS = ("robust", "paper")
 METHODS = ("sift", "terrain", "mutual_information")
+WARPS = ("none", "auto", "similarity", "dome", "quadratic", "spline")
 
 
 @dataclass(frozen=True)
-class RasterSettings:
+class RasterSettings(Checked):
     """Rasterizing (`meshreg.raster`).
 
     `None` for a cell means: the paper's 0.10 m (DEM) and 0.05 m (orthomosaic), coarser or finer
     as the data's own spacing tells; SIFT at the texture's spacing, not finer than 0.01 to 0.02 m.
     """
 
-    dem_cell: float | None = None
-    ortho_cell: float | None = None
-    sift_cell: float | None = None
-    fill_cells: int = 1  # holes up to this many cells wide are closed, never more
-    remove_floaters: bool = True
-    mask_flat_color: bool = True
-    max_cells: int = 400_000_000  # per raster; more is a ResourceLimitError
+    section: ClassVar[str] = "raster"
+    dem_cell: float | None = number(
+        None, "side of a cell of the DEM", low=1e-5, high=1000, unit="m", unset="from the data"
+    )
+    ortho_cell: float | None = number(
+        None, "of the orthomosaic", low=1e-5, high=1000, unit="m", unset="from the data"
+    )
+    sift_cell: float | None = number(
+        None, "of the image for SIFT", low=1e-5, high=1000, unit="m", unset="from the data"
+    )
+    fill_cells: int = number(
+        1, "holes up to this wide are closed, never wider", low=0, high=100, unit="cells"
+    )
+    remove_floaters: bool = flag(True, "leave out blobs that float over the ground")
+    mask_flat_color: bool = flag(True, "leave out colors of areas of one flat color")
+    max_cells: int = number(
+        400_000_000, "per raster; more ends with exit code 5", low=1, high=1e12, unit="cells"
+    )
 
 
 @dataclass(frozen=True)
-class SearchSettings:
+class SearchSettings(Checked):
     """The window of offsets, shared by the methods."""
 
-    radius: float | None = (
-        None  # per axis [m]; None: 10 m, more where the DEM is coarser than 0.10 m
+    section: ClassVar[str] = "search"
+    radius: float | None = number(
+        None,
+        "largest offset east or north",
+        above=0,
+        high=1e6,
+        unit="m",
+        unset="10 m, more where the DEM is coarser than 0.10 m",
     )
-    min_overlap: float = 0.10  # of the largest in the window (paper: 0.30); less is not scored
-    max_yaw: float = 8.0  # [degrees] either way; with max_scale 0 too, offsets alone are searched
-    max_scale: float = 0.03  # either way from 1
-    free_scale: bool = False  # True: fit the scale too; otherwise it stays 1 unless plainly wrong
+    min_overlap: float = number(
+        0.10, "of the largest in the window (paper: 0.30); less is not scored", low=0, high=1
+    )
+    max_yaw: float = number(
+        8.0,
+        "turn either way; with `max_scale` 0 too, offsets alone are searched",
+        low=0,
+        high=15,
+        unit="degrees",
+    )
+    max_scale: float = number(0.03, "scale either way from 1", low=0, high=0.2)
+    free_scale: bool = flag(
+        False, "true: fit the scale too; otherwise it stays 1 unless plainly wrong"
+    )
 
 
 @dataclass(frozen=True)
-class SiftSettings:
+class SiftSettings(Checked):
     """III-B. Paper: nearest neighbour, RANSAC of 10 pairs, inliers within 0.20 m."""
 
-    inlier_radius: float = 0.20
-    sample: int = 10
-    inlier_share: float = 0.5  # w
-    confidence: float = 0.99  # p
-    max_features: int = 20_000
-    tile: int = 2048  # px; larger images are worked in tiles
-    max_false_alarms: float = 1e-3  # robust: a-contrario number of false alarms
-    exhaustive_vote: bool = True  # robust; False is the paper's RANSAC
-    ratio: float = 0.9  # robust: nearest over second nearest descriptor distance; 1.0 keeps all
+    section: ClassVar[str] = "sift"
+    inlier_radius: float = number(
+        0.20, "matches this near the consensus agree", above=0, high=1000, unit="m"
+    )
+    sample: int = number(10, "pairs in a sample of RANSAC", low=2, high=1000)
+    inlier_share: float = number(
+        0.5, "w of RANSAC: share of inliers that is reckoned with", above=0, below=1
+    )
+    confidence: float = number(
+        0.99, "p of RANSAC: that a sample without outliers is drawn", above=0, below=1
+    )
+    max_features: int = number(20_000, "features of an image", low=10, high=1_000_000)
+    tile: int = number(2048, "larger images are worked in tiles", low=64, high=32_768, unit="px")
+    max_false_alarms: float = number(
+        1e-3, "robust: a-contrario number of false alarms", above=0, high=1e6
+    )
+    exhaustive_vote: bool = flag(True, "robust; false is the paper's RANSAC")
+    ratio: float = number(
+        0.9,
+        "robust: nearest over second nearest descriptor distance; 1.0 keeps all",
+        above=0,
+        high=1,
+    )
 
 
 @dataclass(frozen=True)
-class TerrainSettings:
+class TerrainSettings(Checked):
     """III-C. Paper: mean squared height difference over the product of spreads."""
 
-    high_pass: tuple[float, ...] = (2.0, 5.0)  # sigma in DEM cells; empty is the paper's raw height
+    section: ClassVar[str] = "terrain"
+    high_pass: tuple[float, ...] = listed(
+        (2.0, 5.0),
+        "sigma of the smoothing that is taken off the heights; empty is the paper's raw height",
+        most=8,
+        above=0,
+        high=1000,
+        unit="cells",
+    )
 
 
 @dataclass(frozen=True)
-class MutualInformationSettings:
+class MutualInformationSettings(Checked):
     """III-D. Paper: 256 grey values, direct count."""
 
-    bins: int = 8  # a finer histogram finds no more and takes longer
-    high_pass: float = 0.5  # sigma [m] of the local mean and spread that are removed; 0 is raw grey
-    direct: bool = False  # the paper's direct count over all bins
+    section: ClassVar[str] = "mutual_information"
+    bins: int = number(
+        8, "grey values of the histogram; more find no more and take longer", low=2, high=256
+    )
+    high_pass: float = number(
+        0.5,
+        "sigma of the local mean and spread that are removed; 0 is raw grey",
+        low=0,
+        high=1000,
+        unit="m",
+    )
+    direct: bool = flag(False, "the paper's direct count over all bins")
 
 
 @dataclass(frozen=True)
-class JudgeSettings:
+class JudgeSettings(Checked):
     """Accept, review or reject (`meshreg.judge`)."""
 
-    agree_distance: float = 0.25  # [m], or 2.5 DEM cells where that is more
-    min_overlap: float = 0.25  # of the smaller survey's cells; less goes to review
-    support_gap: float = 1.5  # a channel that puts a place first by this much supports it
-    accept_gap: float = 4.0
-    overwhelming_gap: float = 7.0
-    max_false_alarm: float = 1e-6  # more is not accepted
-    chance_false_alarm: float = 1e-3  # more is chance: rejected
-    # [m], of 98 % of the heights about their surroundings: what depths good to 5 cm feign. Where a
-    # survey is flatter and no offset stands out, that is not taken for another place.
-    flat_relief: float = 0.10
+    section: ClassVar[str] = "judge"
+    agree_distance: float = number(
+        0.25, "answers this near agree, or 2.5 DEM cells where more", above=0, high=1000, unit="m"
+    )
+    min_overlap: float = number(
+        0.25, "of the smaller survey's cells; less goes to review", low=0, high=1
+    )
+    support_gap: float = number(
+        1.5, "a channel that puts a place first by this much supports it", low=0, high=1000
+    )
+    accept_gap: float = number(4.0, "by this much, it is believed", low=0, high=1000)
+    overwhelming_gap: float = number(
+        7.0, "by this much, one channel alone is believed", low=0, high=1000
+    )
+    max_false_alarm: float = number(1e-6, "more is not accepted", low=0, high=1)
+    chance_false_alarm: float = number(1e-3, "more is chance: rejected", low=0, high=1)
+    # What depths good to 5 cm feign. Where a survey is flatter and no offset stands out, that is
+    # not taken for another place.
+    flat_relief: float = number(
+        0.10,
+        "of 98 % of the heights about their surroundings; less may be any place",
+        low=0,
+        high=1000,
+        unit="m",
+    )
 
 
 @dataclass(frozen=True)
-class RefineSettings:
+class RefineSettings(Checked):
     """From a cell to a millimetre (`meshreg.refine`, `heights`, `surfaces`)."""
 
-    surfaces: str = "none"  # "gicp": a last step on the 3-D surfaces, with Open3D
+    section: ClassVar[str] = "refine"
+    surfaces: str = choice(
+        "none", "gicp: a last step on the 3-D surfaces, with Open3D", ("none", "gicp")
+    )
 
 
 @dataclass(frozen=True)
-class WarpSettings:
+class WarpSettings(Checked):
     """The non-rigid answer (`meshreg.warp`); the internal error is measured whatever this says."""
 
-    model: str = "none"  # "auto", or one of "similarity", "dome", "quadratic", "spline"
-    # a bend that changes lengths across the survey by more (rms, `ladder.strain`) is not applied
-    max_strain: float = 0.01
+    section: ClassVar[str] = "warp"
+    model: str = choice("none", "the bend that is applied", WARPS)
+    max_strain: float = number(
+        0.01,
+        "a bend that changes lengths across the survey by more (rms) is not applied",
+        low=0,
+        high=1,
+    )
 
 
 @dataclass(frozen=True)
-class Settings:
+class Settings(Checked):
     """All stages together."""
 
-    preset: Preset = "robust"
-    methods: tuple[str, ...] = METHODS
-    seed: int = 0
+    preset: Preset = choice("robust", "sturdier methods, or exactly as published", PRESETS)
+    methods: tuple[str, ...] = choice(METHODS, "that look for the offset", METHODS)
+    seed: int = number(0, "of every random draw", low=0, high=2**31 - 1)
     raster: RasterSettings = field(default_factory=RasterSettings)
     search: SearchSettings = field(default_factory=SearchSettings)
     sift: SiftSettings = field(default_factory=SiftSettings)
@@ -140,7 +236,7 @@ class Settings:
                 terrain=TerrainSettings(high_pass=()),
                 mutual_information=MutualInformationSettings(bins=256, high_pass=0.0, direct=True),
             )
-        raise UsageError(f"Unknown preset {preset!r}.", remedy='Use "robust" or "paper".')
+        raise UsageError(f"Unknown preset {shown(preset)}.", remedy='Use "robust" or "paper".')
 
     def changed(self, changes: Mapping[str, Any]) -> Settings:
         """Return a copy with `{"stage.name": value}` set; strings are read as TOML values."""
@@ -162,18 +258,17 @@ def read_settings(path: str | Path, base: Settings | None = None) -> Settings:
     Raises
     ------
     UsageError
-        If the file is no TOML, or a key or a value's type is unknown.
+        If the file is no TOML, a key is unknown, or a value is of another type or out of range.
     """
     path = Path(path)
+    document = read_toml(path, "Settings")
     try:
-        document = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise UsageError(f"Settings cannot be read: {error}.", file=path) from error
-    preset = document.pop("preset", None)
-    settings = (
-        base if base is not None and preset is None else Settings.from_preset(preset or "robust")
-    )
-    return settings.changed(_flat(document))
+        preset = document.pop("preset", None)
+        if preset is not None:
+            base = Settings.from_preset(preset)
+        return (base or Settings()).changed(_flat(document))
+    except UsageError as error:
+        raise UsageError(error.message, file=path, remedy=error.remedy) from error
 
 
 def write_settings(settings: Settings) -> str:
@@ -203,43 +298,33 @@ def _set(record: Any, key: str, path: list[str], value: Any) -> Any:
     names = {f.name: f for f in fields(record)}
     if path[0] not in names:
         raise UsageError(
-            f"Unknown setting {key!r}.", remedy=f"Here there are: {', '.join(sorted(names))}."
+            f"Unknown setting {shown(key)}.", remedy=f"Here there are: {', '.join(sorted(names))}."
         )
     present = getattr(record, path[0])
     if is_dataclass(present) != (len(path) > 1):
-        raise UsageError(f"{key!r} does not name a single setting.", remedy="Use stage.name=value.")
+        raise UsageError(
+            f"{shown(key)} does not name a single setting.", remedy="Use stage.name=value."
+        )
     if len(path) > 1:
         value = _set(present, key, path[1:], value)
     else:
-        value = _coerce(key, value, str(names[path[0]].type))
+        item = names[path[0]]
+        value = _coerce(key, value, str(item.type), item.metadata["limits"])
     return dataclasses.replace(record, **{path[0]: value})
 
 
-def _coerce(key: str, value: Any, kind: str) -> Any:
-    """Fit a TOML value (or its text) to the annotation `kind`; the annotation is the one schema."""
-    optional = kind.endswith(" | None")
+def _coerce(key: str, value: Any, kind: str, limits: Limits) -> Any:
+    """Fit a TOML value (or its text) to the annotation `kind` and the range."""
     base = kind.removesuffix(" | None")
     if isinstance(value, str) and base not in ("str", "Preset"):
-        if optional and value.lower() in ("none", "auto", ""):
+        if base != kind and value.lower() in ("none", "auto", ""):
             return None
         if base == "tuple[str, ...]" and not value.startswith("["):
-            return tuple(part.strip() for part in value.split(",") if part.strip())
-        try:
-            value = tomllib.loads(f"v = {value}")["v"]
-        except tomllib.TOMLDecodeError as error:
-            raise UsageError(f"{key} = {value!r} is not a value of type {kind}.") from error
-    if value is None and optional:
-        return None
-    if base == "float" and isinstance(value, int | float) and not isinstance(value, bool):
-        return float(value)
-    if base == "int" and isinstance(value, int) and not isinstance(value, bool):
-        return value
-    if base == "bool" and isinstance(value, bool):
-        return value
-    if base in ("str", "Preset") and isinstance(value, str):
-        return value
-    if base == "tuple[float, ...]" and isinstance(value, list | tuple):
-        return tuple(float(item) for item in value)
-    if base == "tuple[str, ...]" and isinstance(value, list | tuple):
-        return tuple(str(item) for item in value)
-    raise UsageError(f"{key} = {value!r} is not a value of type {kind}.")
+            value = tuple(part.strip() for part in value.split(",") if part.strip())
+        else:
+            try:
+                value = parse_toml(f"v = {value}")["v"]
+            except ValueError as error:
+                said = f"{key} is {shown(value)}; it must be {wanted(kind, limits)}."
+                raise UsageError(said) from error
+    return check(key, value, kind, limits)
