@@ -72,7 +72,8 @@ def _size(path: str) -> int:
     from meshreg.io.blocks import find_blocks
 
     with suppress(MeshregError, OSError):
-        files = [block.path for block in find_blocks(path)]
+        blocks = find_blocks(path)
+        files = [file for block in blocks for file in (block.maps or (block.path,))]
         inside = [f for path in files for f in (path.iterdir() if path.is_dir() else [path])]
         return sum(file.stat().st_size for file in inside)
     return 0

@@ -99,9 +99,10 @@ def read_pairs(
 
 def about_files(ties: str) -> dict[str, Any]:
     """Names and checksums of the files that pairs come from."""
+    from meshreg.io.finding import split_pair
     from meshreg.io.safe import sha256
 
-    paths = [Path(ties)] if Path(ties).is_file() else [Path(p.strip()) for p in ties.split(",")]
+    paths = (Path(ties),) if Path(ties).is_file() else split_pair(ties)
     return {"files": [p.name for p in paths], "sha256": [sha256(p) for p in paths]}
 
 

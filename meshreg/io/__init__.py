@@ -92,8 +92,9 @@ def read_survey(
     Parameters
     ----------
     path : path, glob or sequence of paths
-        A file; a folder with files of one format, or a COLMAP model folder; a glob ("site/*.las");
-        a list; "dem.tif,ortho.tif". Several files are blocks of one survey and are merged.
+        A file; a folder with files of one format (or, where it has none, with folders of tiles
+        that do), or a COLMAP model folder; a glob ("site/*.las"); a list; "dem.tif,ortho.tif".
+        Several files are blocks of one survey and are merged.
     options : ReadOptions, optional
         What the files do not say themselves: shift, axes, up, unit, CRS.
     **overrides
@@ -128,6 +129,8 @@ def read_survey(
     options = dataclasses.replace(options, **overrides)
     found = blocks.find_blocks(path)
     surveys = [blocks.read_block(block, options) for block in found]
+    if len(found) > 1 and found[0].below:
+        merging.require_apart(surveys, path)
     return without_repeats(surveys[0] if len(surveys) == 1 else merging.merge(surveys, path))
 
 

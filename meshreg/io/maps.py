@@ -7,6 +7,8 @@ or feet, or of pixels that are not square are sampled anew on reading (`meshreg.
 from __future__ import annotations
 
 import logging
+import os
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
@@ -15,6 +17,7 @@ import numpy as np
 
 from meshreg.errors import InputError, UsageError
 from meshreg.io.bridge import bridge
+from meshreg.io.finding import split_maps
 from meshreg.io.geotiff import is_picture
 from meshreg.io.geotiff_values import RawMap, read_color, read_height
 from meshreg.io.geotiff_write import write_color, write_height
@@ -33,13 +36,13 @@ _ANY_SIZE = 1 << 62
 _PAIR = 'Give both as "dem.tif,ortho.tif".'
 
 
-def read(path: Path | str, options: ReadOptions) -> Survey:
+def read(path: Path | str | Sequence[Path], options: ReadOptions) -> Survey:
     """Read a DEM, or a DEM and its orthomosaic as "dem.tif,ortho.tif" (in either order).
 
     Parameters
     ----------
-    path : Path or str
-        One file, or two joined by a comma.
+    path : Path, str or sequence of Path
+        One file, or two, in a sequence or joined by a comma.
     options : ReadOptions
         `unit` is that of the heights (and of x and y, where there is no CRS); ``axes="ned"``
         means that heights count downward; `crs` stands in for the files' own.
@@ -49,9 +52,11 @@ def read(path: Path | str, options: ReadOptions) -> Survey:
     InputError
         See `read_pair`.
     """
-    parts = [Path(part.strip()) for part in str(path).split(",")]
-    if Path(path).is_file():
-        parts = [Path(path)]
+    if not isinstance(path, str | Path):
+        parts = tuple(path)
+    else:
+        whole = os.path.lexists(path)
+        parts = (Path(path),) if whole else split_maps(str(path)) or (Path(path),)
     if len(parts) > 2:
         raise UsageError(f"{len(parts)} maps were given; a survey has two.", remedy=_PAIR)
     if len(parts) == 1:

@@ -60,6 +60,48 @@ def merge(surveys: Sequence[Survey], path: Any) -> Survey:
     )
 
 
+def require_apart(surveys: Sequence[Survey], path: Any) -> None:
+    """Make sure that blocks found in folders of a folder lie beside each other.
+
+    Two surveys of one place in the folders of a project are not blocks of one survey.
+
+    Raises
+    ------
+    InputError
+        Two of them cover the same ground: more than half of the smaller one's bounds.
+    """
+    ends = np.array([survey.bounds for survey in surveys])
+    order = np.argsort(ends[:, 0, 0], kind="stable")
+    for place, one in enumerate(order):
+        low, high = ends[one]
+        for other in order[place + 1 :]:
+            if ends[other, 0, 0] >= high[0]:
+                break
+            both = np.minimum(high, ends[other, 1]) - np.maximum(low, ends[other, 0])
+            sizes = np.minimum(high - low, ends[other, 1] - ends[other, 0])
+            if (
+                (both[:2] > 0).all()
+                and both[2] >= 0
+                and (both / np.fmax(sizes, 1e-9))[:2].prod() > 0.5
+            ):
+                names = [_place_of(surveys[index], path) for index in (one, other)]
+                raise InputError(
+                    f"holds folders with surveys of the same ground ({names[0]} and {names[1]}), "
+                    "which are not blocks of one survey.",
+                    file=str(path),
+                    remedy="Name the one that is meant, or its tiles by a quoted pattern.",
+                )
+
+
+def _place_of(survey: Survey, path: Any) -> str:
+    """Return where a block's file lies below the folder that was named."""
+    file = survey.source[0].path
+    try:
+        return str(file.relative_to(path))
+    except (ValueError, TypeError):
+        return file.name
+
+
 def _common_name(surveys: Sequence[Survey], path: Any) -> str:
     if isinstance(path, str | Path) and Path(path).is_dir():
         return Path(path).resolve().name

@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from meshreg.errors import InputError, UsageError
+from meshreg.io.finding import split_pair
 from meshreg.ties.foreign import KNOWN, Context, Named
 from meshreg.ties.markers import is_markers, read_markers
 from meshreg.ties.records import MAX_NAME, Point, TiePair, TiePoints
@@ -27,9 +28,7 @@ def read_points(path: str | Path, context: Context | None = None) -> TiePoints:
         More than two files, or pixels whose orthomosaic is not known.
     """
     context = context or Context()
-    paths = [Path(part.strip()) for part in str(path).split(",")]
-    if Path(path).is_file():
-        paths = [Path(path)]
+    paths = (Path(path),) if Path(path).is_file() else split_pair(str(path))
     if len(paths) > 2:
         raise UsageError(f"{len(paths)} files of points were given.", remedy=KNOWN)
     if len(paths) == 2:
