@@ -106,10 +106,10 @@ def number(
     return field(default=default, metadata={"limits": limits})
 
 
-def listed(default: tuple[float, ...], what: str, *, most: int = 16, **said: Any) -> Any:
-    """Return a field for a list of up to `most` numbers, each within a range as in `number`."""
+def listed(default: Any, what: str, *, least: int = 0, most: int = 16, **said: Any) -> Any:
+    """Return a field for `least` to `most` numbers, each within a range as in `number`."""
     limits: Limits = dataclasses.replace(
-        number(None, what, **said).metadata["limits"], length=(0, most)
+        number(None, what, **said).metadata["limits"], length=(least, most)
     )
     return field(default=default, metadata={"limits": limits})
 
@@ -137,11 +137,24 @@ class Checked:
     section: ClassVar[str] = ""  # of the settings: "raster", ...
 
     def __post_init__(self) -> None:
-        for item in dataclasses.fields(self):  # type: ignore[arg-type]
-            if (limits := item.metadata.get("limits")) is not None:
-                key = f"{self.section}.{item.name}" if self.section else item.name
-                value = check(key, getattr(self, item.name), str(item.type), limits)
-                object.__setattr__(self, item.name, value)
+        for name, value in checked_values(self, self.section).items():
+            object.__setattr__(self, name, value)
+
+
+def checked_values(record: Any, section: str = "") -> dict[str, Any]:
+    """Return a dataclass's fields that have limits, each in its type.
+
+    Raises
+    ------
+    UsageError
+        A field has another type than its annotation says, or is out of its range.
+    """
+    found = {}
+    for item in dataclasses.fields(record):
+        if (limits := item.metadata.get("limits")) is not None:
+            key = f"{section}.{item.name}" if section else item.name
+            found[item.name] = check(key, getattr(record, item.name), str(item.type), limits)
+    return found
 
 
 def check(key: str, value: Any, kind: str, limits: Limits) -> Any:
@@ -154,8 +167,8 @@ def check(key: str, value: Any, kind: str, limits: Limits) -> Any:
     value : object
         Numbers may be of NumPy; a list may stand for a tuple.
     kind : str
-        "float", "int", "bool", "str", "tuple[float, ...]", "tuple[str, ...]", "Preset", the first
-        two with " | None" too.
+        "float", "int", "bool", "str", "tuple[float, ...]", "tuple[str, ...]", "Preset",
+        'Literal["a", "b"]', each with " | None" too.
     limits : Limits
 
     Raises
@@ -168,6 +181,8 @@ def check(key: str, value: Any, kind: str, limits: Limits) -> Any:
         return None
     if base.startswith("tuple["):
         inner = base.removeprefix("tuple[").partition(",")[0]
+        if hasattr(value, "tolist"):
+            value = value.tolist()
         if isinstance(value, list | tuple):
             items = tuple(_single(item, inner, limits) for item in value)
             least, most = limits.length
@@ -192,7 +207,7 @@ def _single(value: Any, kind: str, limits: Limits) -> Any:
         except OverflowError:  # an integer of hundreds of digits
             return None
         return real if limits.allow(real) else None
-    if kind in ("str", "Preset") and isinstance(value, str):
+    if kind.startswith(("str", "Preset", "Literal")) and isinstance(value, str):
         return value if not limits.choices or value in limits.choices else None
     return None
 
@@ -207,7 +222,8 @@ def wanted(kind: str, limits: Limits) -> str:
         if limits.choices:
             text = f"a list of some of {said.removeprefix('one of ')}, none twice"
         else:
-            text = f"a list of {least} to {most} numbers, each {said}"
+            count = f"{most}" if least == most else f"{least} to {most}"
+            text = f"a list of {count} numbers, each {said}"
     elif limits.choices:
         text = said
     else:

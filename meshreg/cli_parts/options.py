@@ -7,8 +7,9 @@ from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from meshreg.checked import shown
 from meshreg.errors import UsageError
-from meshreg.io.options import ReadOptions
+from meshreg.io.options import FARTHEST, ReadOptions
 from meshreg.settings import Settings, read_settings
 
 if TYPE_CHECKING:
@@ -43,7 +44,8 @@ def read_options(shift: str | None, name: str, **said: Any) -> ReadOptions:
     plain: dict[str, Any] = {
         key: str(value) if isinstance(value, StrEnum) else value for key, value in said.items()
     }
-    return ReadOptions(shift=None if shift is None else _triple(shift, name), **plain)
+    said_shift = None if shift is None else _triple(shift, name)
+    return ReadOptions(shift=said_shift, **plain).checked()
 
 
 def survey_request(path: str, shift: str | None, **said: Any) -> SurveyRequest:
@@ -79,9 +81,11 @@ def survey_requests(
 def _triple(text: str, name: str) -> tuple[float, float, float]:
     try:
         east, north, up = (float(part) for part in text.split(","))
+        if not all(abs(value) <= FARTHEST for value in (east, north, up)):  # NaN too
+            raise ValueError(text)
     except ValueError:
         raise UsageError(
-            f"{name} is {text!r}; it needs three numbers.",
+            f"{name} is {shown(text)}; it needs three numbers of up to {FARTHEST:g} m.",
             remedy=f"Write {name} 731000,5705000,0 (east, north, up in metres).",
         ) from None
     return east, north, up

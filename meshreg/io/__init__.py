@@ -117,7 +117,7 @@ def read_survey(
     ResourceLimitError
         A texture page over `max_pixels`.
     UsageError
-        An unknown option.
+        An unknown option, or a value out of its range.
     """
     from meshreg.io import blocks, merging
     from meshreg.io.unique import without_repeats
@@ -126,7 +126,7 @@ def read_survey(
     known = {item.name for item in dataclasses.fields(ReadOptions)}
     if unknown := sorted(overrides.keys() - known):
         raise UsageError(f"unknown option {unknown[0]!r}.", remedy=f"There are {sorted(known)}.")
-    options = dataclasses.replace(options, **overrides)
+    options = dataclasses.replace(options, **overrides).checked()
     found = blocks.find_blocks(path)
     surveys = [blocks.read_block(block, options) for block in found]
     if len(found) > 1 and found[0].below:

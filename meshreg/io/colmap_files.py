@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from meshreg.errors import InputError, UsageError
-from meshreg.io.safe import file_bytes, open_regular
+from meshreg.io.safe import file_bytes, open_regular, require_inside
 from meshreg.types import Float64, UInt8
 
 PARTS = ("cameras", "images", "points3D")
@@ -77,13 +77,14 @@ def find_model(root: Path) -> ModelFiles:
     UsageError
         Several models; it lists their sizes.
     InputError
-        No model, or one with files missing, which it names.
+        No model, or one with files missing, which it names; files that are links out of the
+        folder.
     """
     if not root.is_dir():
         raise InputError("is no folder of a COLMAP model.", file=root, remedy="Name its folder.")
     for place in (root, root / "sparse"):
         if any(_present(place, suffix) for suffix in (".bin", ".txt")):
-            return _complete(place)
+            return _complete(place, root)
         numbered = sorted(
             (f for f in place.glob("[0-9]*") if f.is_dir() and f.name.isdigit()),
             key=lambda folder: int(folder.name),
@@ -97,7 +98,7 @@ def find_model(root: Path) -> ModelFiles:
                 remedy=f"Name the one that is meant, e.g. {models[0]}.",
             )
         if models:
-            return _complete(models[0])
+            return _complete(models[0], root)
     raise InputError(
         f"holds no COLMAP model ({', '.join(PARTS)} as .bin or .txt).",
         file=root,
@@ -109,11 +110,14 @@ def _present(folder: Path, suffix: str) -> list[str]:
     return [part for part in PARTS if (folder / f"{part}{suffix}").exists()]
 
 
-def _complete(folder: Path) -> ModelFiles:
+def _complete(folder: Path, root: Path) -> ModelFiles:
     """Choose the .bin files, else the .txt files; name what is missing where neither is whole."""
     for suffix in (".bin", ".txt"):
         if len(_present(folder, suffix)) == len(PARTS):
-            return ModelFiles(folder, suffix)
+            files = ModelFiles(folder, suffix)
+            for path in files.paths:
+                require_inside(path, root)
+            return files
     suffix = max((".bin", ".txt"), key=lambda s: len(_present(folder, s)))
     missing = [f"{part}{suffix}" for part in PARTS if part not in _present(folder, suffix)]
     raise InputError(

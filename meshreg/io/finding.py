@@ -12,7 +12,7 @@ from pathlib import Path
 
 from meshreg.errors import InputError, UsageError
 from meshreg.io import READERS
-from meshreg.io.safe import open_regular
+from meshreg.io.safe import open_regular, require_inside
 from meshreg.io.sidecar import is_sidecar
 
 _MAGIC = (
@@ -224,7 +224,7 @@ def _folder_blocks(folder: Path) -> tuple[Block, ...]:
     files = sorted(entry for entry in folder.iterdir() if _is_survey(entry))
     for number, rank in enumerate(_FOLDER_RANKS):
         if fits := _of_rank(files, rank):
-            blocks = _one_format(fits, folder)
+            blocks = _one_format(_inside(fits, folder), folder)
             # tables and notes in .csv and .txt are too common beside a survey to be worth a word
             others = _of_rank(
                 files, ((".tif", ".tiff"), (".xyz",), (".pts",)) if number < 1 else ()
@@ -235,13 +235,21 @@ def _folder_blocks(folder: Path) -> tuple[Block, ...]:
             )
             return (replace(blocks[0], note=note if others else ""), *blocks[1:])
     if tiles := _tiles_below(folder):
-        return tuple(replace(block, below=True) for block in _one_format(tiles, folder))
+        return tuple(
+            replace(block, below=True) for block in _one_format(_inside(tiles, folder), folder)
+        )
     raise InputError(
         "is a folder without a survey file in it.",
         file=folder,
         remedy=_deeper(folder)
         or f"Surveys are read as {', '.join(key for key in READERS if key)}.",
     )
+
+
+def _inside(files: list[Path], folder: Path) -> list[Path]:
+    for path in files:
+        require_inside(path, folder)
+    return files
 
 
 def _of_rank(files: Sequence[Path], rank: Sequence[tuple[str, ...]]) -> list[Path]:

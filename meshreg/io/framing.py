@@ -6,9 +6,10 @@ from typing import Any
 
 import numpy as np
 
+from meshreg.checked import shown
 from meshreg.errors import InputError, UsageError
 from meshreg.io.crs import check_area, crs_name, crs_text, metres_per_unit, metric_crs
-from meshreg.io.options import ReadOptions
+from meshreg.io.options import UNIT_RANGE, ReadOptions
 from meshreg.io.sidecar import SidecarInfo
 from meshreg.types import Float64, Frame
 
@@ -122,10 +123,12 @@ def _unit(unit: str | float) -> float:
     try:
         named = UNITS.get(unit.strip().lower()) if isinstance(unit, str) else None
         length = float(unit) if named is None else named
-    except ValueError:
+    except (ValueError, OverflowError):
         length = None
-    if length is None or not (np.isfinite(length) and length > 0):
+    if length is None or not UNIT_RANGE[0] <= length <= UNIT_RANGE[1]:
+        low, high = UNIT_RANGE
         raise UsageError(
-            f"unit {unit!r} is not known.", remedy=f"Use one of {', '.join(UNITS)}, or metres."
+            f"unit {shown(unit)} is not known.",
+            remedy=f"Use one of {', '.join(UNITS)}, or metres, from {low:g} to {high:g}.",
         )
     return length

@@ -16,7 +16,7 @@ import numpy as np
 
 from meshreg.errors import InputError, ResourceLimitError
 from meshreg.io.crs import crs_text, mend_proj_data
-from meshreg.io.safe import open_regular
+from meshreg.io.safe import beside, open_regular
 from meshreg.types import Float64
 
 MAGIC = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
@@ -120,9 +120,8 @@ def lattice(dataset: Any, path: Path) -> Float64:
     affine = dataset.transform
     matrix = np.array([[affine.a, affine.b, affine.c], [affine.d, affine.e, affine.f]], float)
     if affine.is_identity:
-        world = next(
-            (path.with_suffix(s) for s in _WORLD_FILES if path.with_suffix(s).is_file()), None
-        )
+        named = (beside(path.parent, path.with_suffix(suffix).name) for suffix in _WORLD_FILES)
+        world = next((file for file in named if file is not None), None)
         if world is None:
             where = "ground control points only" if dataset.gcps[0] else "no georeference"
             raise InputError(

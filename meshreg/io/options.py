@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
+
+from meshreg.checked import checked_values, choice, flag, listed, number
+
+FARTHEST = 1e9  # m; the Earth's own coordinates stay under 1e8 in feet
+UNIT_RANGE = (1e-9, 1e9)  # metres per unit
 
 
 @dataclass(frozen=True)
@@ -33,12 +38,26 @@ class ReadOptions:
         Largest texture page that is opened.
     """
 
-    shift: tuple[float, float, float] | None = None
-    axes: Literal["enu", "ned"] | None = None
-    up: Literal["y", "z"] | None = None
+    shift: tuple[float, float, float] | None = listed(
+        None, "added to coordinates", least=3, most=3, low=-FARTHEST, high=FARTHEST, unit="m"
+    )
+    axes: Literal["enu", "ned"] | None = choice(None, "of the file", ("enu", "ned"))
+    up: Literal["y", "z"] | None = choice(None, "axis of the file that points up", ("y", "z"))
     unit: str | None = None
     crs: str | None = None
     positions: Path | None = None
-    scale: float | None = None
-    geometry_only: bool = False
-    max_pixels: int = 1_000_000_000
+    scale: float | None = number(
+        None, "metres per unit", low=UNIT_RANGE[0], high=UNIT_RANGE[1], unit="m"
+    )
+    geometry_only: bool = flag(False, "leave out textures")
+    max_pixels: int = number(1_000_000_000, "of a texture page", low=1, high=1e12)
+
+    def checked(self) -> ReadOptions:
+        """Return the options with each value in its type.
+
+        Raises
+        ------
+        UsageError
+            A shift that is not finite, a scale of zero, or another value out of its range.
+        """
+        return replace(self, **checked_values(self))

@@ -1,6 +1,7 @@
 """Open only what is safe to open, write whole files or none.
 
-Every reader passes the names found inside a survey file through `resolve_reference`, every
+Every reader passes the names found inside a survey file through `resolve_reference`, those that it
+looks for by itself through `beside` (a side file) or `require_inside` (what a folder holds), every
 declared count through `require`; every writer goes through `atomic_file` or `atomic_folder`.
 """
 
@@ -79,6 +80,49 @@ def resolve_reference(folder: Path, name: str | bytes, *, root: Path) -> Path:
         file=folder,
         remedy="Copy it there, under that name.",
     )
+
+
+def beside(folder: Path, name: str) -> Path | None:
+    """Find a side file: one that is looked for by its usual name, and not named by anybody.
+
+    Parameters
+    ----------
+    folder : Path
+        The survey's folder.
+    name : str
+        With folders where it lies in one: "odm_georeferencing/coords.txt".
+
+    Returns
+    -------
+    Path or None
+        A regular file in `folder`, links followed; None where there is none of that name.
+
+    Raises
+    ------
+    UnsafeReferenceError
+        A link that leaves `folder`.
+    """
+    candidate = Path(folder) / name
+    if not candidate.is_file():
+        return None
+    require_inside(candidate, folder)
+    return candidate
+
+
+def require_inside(path: Path, root: Path) -> None:
+    """Refuse a file that was found in a folder, not named, if it is a link that leaves it.
+
+    Raises
+    ------
+    UnsafeReferenceError
+        The file that is meant, links followed, does not lie in `root`.
+    """
+    if not Path(path).resolve().is_relative_to(Path(root).resolve()):
+        raise UnsafeReferenceError(
+            "is a link that leaves the survey's folder; it is not opened.",
+            file=path,
+            remedy="Put the file itself there instead of a link, or remove the link.",
+        )
 
 
 def _spellings(name: str | bytes) -> list[str]:
@@ -296,6 +340,7 @@ __all__: list[str] = [
     "MissingReferenceError",
     "atomic_file",
     "atomic_folder",
+    "beside",
     "copy_file",
     "decode_name",
     "file_bytes",
@@ -303,6 +348,7 @@ __all__: list[str] = [
     "free_memory",
     "open_regular",
     "require",
+    "require_inside",
     "resolve_reference",
     "sha256",
 ]

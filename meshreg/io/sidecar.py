@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import logging
 import re
-import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,8 +15,10 @@ from typing import Any
 
 import numpy as np
 
+from meshreg.checked import parse_toml, shown
 from meshreg.errors import InputError
-from meshreg.io.safe import decode_name, open_regular
+from meshreg.io.options import FARTHEST, UNIT_RANGE
+from meshreg.io.safe import beside, decode_name, open_regular, require_inside
 from meshreg.io.sidecar_write import write_shift
 
 __all__ = ["SidecarInfo", "find_sidecar", "is_sidecar", "write_shift"]
@@ -93,11 +94,11 @@ def find_sidecar(path: Path, *, shared: bool = True) -> SidecarInfo | None:
     """
     path = Path(path)
     joined = SidecarInfo()
-    for candidate, reader in _candidates(path, shared):
-        if candidate.name != path.name and candidate.is_file():
-            said = reader(candidate)
-            if said is not None:
-                joined = _join(joined, said)
+    for folder, name, reader in _candidates(path, shared):
+        candidate = beside(folder, name) if name != path.name else None
+        said = None if candidate is None else reader(candidate)
+        if said is not None:
+            joined = _join(joined, said)
     return joined if joined.path is not None or joined.notes else None
 
 
@@ -108,35 +109,37 @@ def is_sidecar(path: Path) -> bool:
         return True
     if name == "offset.xyz" or name.endswith("_offset.xyz"):
         try:
+            require_inside(path, path.parent)
             return _read_offset(path) is not None
         except InputError:
             return False
     return False
 
 
-def _candidates(path: Path, shared: bool) -> Iterator[tuple[Path, Any]]:
+def _candidates(path: Path, shared: bool) -> Iterator[tuple[Path, str, Any]]:
+    """Give the folder and the name of each side file that may be there, and what reads it."""
     folder, stem = path.parent, path.stem
     if path.name.lower().endswith(".copc.laz"):
         stem = path.name[: -len(".copc.laz")]
     for name in dict.fromkeys((stem, path.stem)):
-        yield folder / f"{name}.survey.toml", _read_toml
-        yield folder / f"{name}_offset.xyz", _read_offset
-        yield folder / f"{name}.prj", _read_prj
-        yield folder / f"{name}_wkt.prj", _read_prj
+        yield folder, f"{name}.survey.toml", _read_toml
+        yield folder, f"{name}_offset.xyz", _read_offset
+        yield folder, f"{name}.prj", _read_prj
+        yield folder, f"{name}_wkt.prj", _read_prj
         for suffix in (".rcInfo", ".rcinfo"):
-            yield folder / f"{name}{suffix}", _tell_rcinfo
+            yield folder, f"{name}{suffix}", _tell_rcinfo
     if not shared:
         return
-    yield folder / "offset.xyz", _read_offset
+    yield folder, "offset.xyz", _read_offset
     for name in ("SHIFT.txt", "shift.txt", "Shift.txt"):
         if (folder / name).is_file():
-            yield folder / name, _read_shift_txt
+            yield folder, name, _read_shift_txt
             break
-    yield folder / "coords.txt", _read_coords
+    yield folder, "coords.txt", _read_coords
     # OpenDroneMap keeps it apart: odm_texturing/odm_textured_model_geo.obj is what it speaks of.
     if folder.name.startswith("odm_texturing") and stem.endswith("_geo"):
-        yield folder.absolute().parent / _ODM_FOLDER / "coords.txt", _read_coords
-    yield folder / _ODM_FOLDER / "coords.txt", _read_coords
+        yield folder.absolute().parent, f"{_ODM_FOLDER}/coords.txt", _read_coords
+    yield folder, f"{_ODM_FOLDER}/coords.txt", _read_coords
 
 
 def _join(first: SidecarInfo, second: SidecarInfo) -> SidecarInfo:
@@ -279,15 +282,15 @@ def _read_coords(path: Path) -> SidecarInfo:
     number, line = lines[1]
     east, north = _numbers(path, number, line.split()[:2], 2)
     said = _located(path, (east, north, 0.0), lines[0][1])
-    beside = path.with_name("proj.txt")
-    return _join(said, _read_prj(beside)) if beside.is_file() else said
+    repeated = beside(path.parent, "proj.txt")
+    return said if repeated is None else _join(said, _read_prj(repeated))
 
 
 def _read_toml(path: Path) -> SidecarInfo:
     """Read our own .survey.toml; any key may be missing, none may be unknown."""
     try:
-        document = tomllib.loads("\n".join(_lines(path)))
-    except tomllib.TOMLDecodeError as error:
+        document = parse_toml("\n".join(_lines(path)))
+    except ValueError as error:
         raise InputError(f"is not TOML: {error}.", file=path) from error
     for key, value in document.items():
         _check_key(path, key, value)
@@ -314,37 +317,42 @@ def _check_key(path: Path, key: str, value: Any) -> None:
     """Refuse a key or a value that cannot be meant, rather than read the survey elsewhere."""
     from meshreg.io.framing import UNITS
 
-    def numbers(items: Any) -> bool:
+    def within(item: Any, low: float, high: float) -> bool:
+        return type(item) in (int, float) and low <= item <= high  # false for NaN
+
+    def numbers(items: Any, largest: float) -> bool:
         return (
             isinstance(items, list)
             and len(items) == 3
-            and all(type(item) in (int, float) and np.isfinite(item) for item in items)
+            and all(within(item, -largest, largest) for item in items)
         )
 
     wanted = {
         "name": ("text", isinstance(value, str)),
         "date": ("a date", isinstance(value, str) or hasattr(value, "isoformat")),
         "crs": ("text such as 'EPSG:32754'", isinstance(value, str)),
-        "shift": ("three numbers", numbers(value)),
+        "shift": (f"three numbers of up to {FARTHEST:g} m", numbers(value, FARTHEST)),
         "axes": (
             '"enu", "ned" or a 3 × 3 matrix',
             value in ("enu", "ned")
             or (
                 isinstance(value, list)
                 and len(value) == 3
-                and all(map(numbers, value))
-                and abs(np.linalg.det(value)) > 1e-12
+                and all(numbers(row, UNIT_RANGE[1]) for row in value)
+                and abs(np.linalg.det(np.array(value, float))) > 1e-12
             ),
         ),
         "up": ('"y" or "z"', value in ("y", "z")),
         "unit": (
-            f"one of {', '.join(UNITS)}, or metres per unit",
-            (isinstance(value, str) and value in UNITS)
-            or (type(value) in (int, float) and value > 0),
+            f"one of {', '.join(UNITS)}, or metres per unit from {UNIT_RANGE[0]:g} to "
+            f"{UNIT_RANGE[1]:g}",
+            (isinstance(value, str) and value in UNITS) or within(value, *UNIT_RANGE),
         ),
     }
     if key not in wanted:
-        raise InputError(f"{key!r} is not known.", file=path, remedy=f"Use {', '.join(wanted)}.")
+        raise InputError(
+            f"{shown(key)} is not known.", file=path, remedy=f"Use {', '.join(wanted)}."
+        )
     expected, fits = wanted[key]
     if not fits:
-        raise InputError(f"{key} = {value!r}; expected {expected}.", file=path)
+        raise InputError(f"{key} = {shown(value)}; expected {expected}.", file=path)
