@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from meshreg.errors import InputError
 from meshreg.io.assemble import Found, placed_survey
+from meshreg.io.classes import BED, NOISE, OLD_WATER, RECLASS, WATER, class_notes, in_classes
 from meshreg.io.cloud_write import rewrite, write
 from meshreg.io.frames import place
 from meshreg.io.las_header import LasHead, check_header, file_crs
@@ -27,15 +28,15 @@ __all__ = ["read", "rewrite", "write"]
 
 _LOG = logging.getLogger("meshreg")
 _CHUNK_BYTES = 64_000_000
-_NOISE = (7, 18)  # classes "low point" and "high noise"
 _LOST = np.iinfo(np.int32).min  # what NaN becomes in a LAS file
 
 
 def read(path: Path, options: ReadOptions) -> Survey:
     """Read a LAS, LAZ or COPC file as a point cloud.
 
-    Points flagged withheld, classed as noise (7, 18) or without coordinates are left out and
-    counted. The bounds in the header are not believed but taken from the points.
+    Points flagged withheld, classed as noise (7, 18) or water (41, 42, 45; see `classes`) or
+    without coordinates are left out and counted. The bounds in the header are not believed but
+    taken from the points.
 
     Parameters
     ----------
@@ -61,7 +62,8 @@ def read(path: Path, options: ReadOptions) -> Survey:
         steps, colors, counts = _read_points(reader, path, head, options.geometry_only)
     notes += _drop_notes(counts)
     if not len(steps):
-        raise InputError(f"holds no usable point ({' '.join(notes)}).", file=path)
+        remedy = RECLASS if counts["water"] else None
+        raise InputError(f"holds no usable point ({' '.join(notes)}).", file=path, remedy=remedy)
     points = steps * np.array(head.step)
     points += np.array(head.offset)
     del steps
@@ -100,17 +102,25 @@ def _read_points(
     colored = {"red", "green", "blue"} <= names and not geometry_only
     steps: list[NDArray[np.int32]] = []
     colors: list[NDArray[np.uint16]] = []
-    counts = {"withheld": 0, "noise": 0, "without coordinates": 0}
+    counts = {"withheld": 0, "noise": 0, "water": 0, "without coordinates": 0}
+    nines: list[Bool] = []
+    has_bed = False
     seen = 0
     for chunk in reader.chunk_iterator(chunk_points(head.record)):
         seen += len(chunk)
         raw = np.stack([chunk["X"], chunk["Y"], chunk["Z"]], axis=1)
         lost = (raw == _LOST).any(axis=1)
         withheld = np.asarray(chunk["withheld"]).astype(bool) & ~lost
-        noise = np.isin(np.asarray(chunk["classification"]), _NOISE) & ~lost & ~withheld
-        for name, dropped in zip(counts, (withheld, noise, lost), strict=True):
+        classes = np.asarray(chunk["classification"])
+        rest = ~(lost | withheld)
+        noise, water, nine = (
+            in_classes(classes, kind) & rest for kind in (NOISE, WATER, OLD_WATER)
+        )
+        has_bed = has_bed or bool((in_classes(classes, BED) & rest).any())
+        for name, dropped in zip(counts, (withheld, noise, water, lost), strict=True):
             counts[name] += int(np.count_nonzero(dropped))
-        keep = ~(lost | withheld | noise)
+        keep = rest & ~(noise | water)
+        nines.append(nine[keep])
         whole = bool(keep.all())
         steps.append(raw if whole else raw[keep])
         if colored:
@@ -124,9 +134,13 @@ def _read_points(
             remedy="The file is cut off; copy or export it again.",
         )
     joined = np.concatenate(colors) if colored else None
+    points, old_water = np.concatenate(steps), np.concatenate(nines)
+    if has_bed and old_water.any():
+        counts["water"] += int(np.count_nonzero(old_water))
+        points, joined = points[~old_water], None if joined is None else joined[~old_water]
     if joined is not None and not joined.any():
         joined = None  # the fields are there, but nobody filled them
-    return np.concatenate(steps), joined, counts
+    return points, joined, counts
 
 
 def without_strays(points: Float64, notes: list[str]) -> Bool | None:
@@ -156,12 +170,13 @@ def without_strays(points: Float64, notes: list[str]) -> Bool | None:
 
 
 def _drop_notes(counts: dict[str, int]) -> list[str]:
-    texts = {
-        "withheld": "points flagged withheld were left out.",
-        "noise": "points classed as noise (7, 18) were left out.",
-        "without coordinates": "points without coordinates were left out.",
-    }
-    return [f"{counts[name]} {text}" for name, text in texts.items() if counts[name]]
+    notes = [f"{counts['withheld']} points flagged withheld were left out."] * bool(
+        counts["withheld"]
+    )
+    notes += class_notes(counts["noise"], counts["water"])
+    if lost := counts["without coordinates"]:
+        notes.append(f"{lost} points without coordinates were left out.")
+    return notes
 
 
 def _sidecar_says_unit(path: Path) -> bool:

@@ -65,6 +65,19 @@ class Mover:
     _turn: Float64 = field(repr=False)
     warp: Warp | None = None
 
+    @property
+    def turn(self) -> Float64:
+        """(3, 3) orthogonal matrix from directions in the old file to those in the new one.
+
+        Its determinant is -1 where one of the two files has a mirrored frame.
+        """
+        return self._turn
+
+    @property
+    def scale(self) -> float:
+        """Length in the new file of what is 1 long in the old one, units of both included."""
+        return float(np.cbrt(abs(np.linalg.det(self.matrix[:3, :3]))))
+
     def points(self, xyz: Any) -> Float64:
         """Move points (N, 3), old file coordinates to new ones."""
         moved = self.transform.apply(to_absolute(self.source, xyz))

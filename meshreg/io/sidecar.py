@@ -25,7 +25,7 @@ __all__ = ["SidecarInfo", "find_sidecar", "is_sidecar", "write_shift"]
 
 _LOG = logging.getLogger("meshreg")
 _MAX_BYTES = 1 << 20  # coords.txt lists every photograph; the rest are a few lines
-_KEYS = ("name", "date", "crs", "shift", "axes", "up", "unit")
+_KEYS = ("name", "date", "crs", "shift", "axes", "up", "unit", "columns")
 _ODM_CRS = re.compile(r"WGS\s?84\s+UTM|EPSG:|\+proj|\+init|[A-Z]+CRS\[|PROJCS\[", re.IGNORECASE)
 _ODM_FOLDER = "odm_georeferencing"
 
@@ -45,6 +45,8 @@ class SidecarInfo:
     up : "y", "z" or None
     unit : str, float (metres per unit) or None
     name, date : str or None
+    columns : tuple of str or None
+        Names of a text cloud's columns, instead of its header's or of a guess.
     shift_path, crs_path : Path or None
         Where those two came from.
     explicit_crs : bool
@@ -60,6 +62,7 @@ class SidecarInfo:
     unit: str | float | None = None
     name: str | None = None
     date: str | None = None
+    columns: tuple[str, ...] | None = None
     shift_path: Path | None = None
     crs_path: Path | None = None
     explicit_crs: bool = False
@@ -307,6 +310,7 @@ def _read_toml(path: Path) -> SidecarInfo:
         unit=document.get("unit"),
         name=document.get("name"),
         date=None if "date" not in document else str(document["date"]),
+        columns=None if "columns" not in document else tuple(document["columns"]),
         shift_path=None if shift is None else path,
         crs_path=None if crs is None else path,
         explicit_crs=crs is not None,
@@ -347,6 +351,12 @@ def _check_key(path: Path, key: str, value: Any) -> None:
             f"one of {', '.join(UNITS)}, or metres per unit from {UNIT_RANGE[0]:g} to "
             f"{UNIT_RANGE[1]:g}",
             (isinstance(value, str) and value in UNITS) or within(value, *UNIT_RANGE),
+        ),
+        "columns": (
+            "a list of names",
+            isinstance(value, list)
+            and 3 <= len(value) <= 1000
+            and all(isinstance(item, str) for item in value),
         ),
     }
     if key not in wanted:

@@ -142,7 +142,7 @@ def parse_rows(
 
 
 @jit(nogil=True)
-def _put_number(out: Any, at: int, value: float, decimals: int) -> int:
+def _put_number(out: Any, at: int, value: float, decimals: int, mark: int) -> int:
     """Write a number with fixed decimals (fewer where 17 digits do not suffice); return the end."""
     size = abs(value)
     scaled = np.rint(size * 10.0**decimals)
@@ -163,7 +163,7 @@ def _put_number(out: Any, at: int, value: float, decimals: int) -> int:
     here = last - 1
     for place in range(width):
         if place == decimals and decimals > 0:
-            out[here] = 46
+            out[here] = mark
             here -= 1
         out[here] = 48 + digits % 10
         digits //= 10
@@ -172,10 +172,10 @@ def _put_number(out: Any, at: int, value: float, decimals: int) -> int:
 
 
 @jit(nogil=True)
-def _decimals(data: Any, start: int, end: int) -> int:
+def _decimals(data: Any, start: int, end: int, mark: int) -> int:
     """Count the decimals of a plain number; 0 where it has none or is in powers of ten."""
     for here in range(start, end):
-        if data[here] == 46:
+        if data[here] == mark:
             for behind in range(here + 1, end):
                 if not 48 <= data[behind] <= 57:
                     return 0
@@ -185,7 +185,14 @@ def _decimals(data: Any, start: int, end: int) -> int:
 
 @jit(nogil=True)
 def splice_rows(
-    data: Any, state: Any, delimiter: int, columns: Any, numbers: Any, least: Any, out: Any
+    data: Any,
+    state: Any,
+    delimiter: int,
+    columns: Any,
+    numbers: Any,
+    least: Any,
+    out: Any,
+    mark: int = 46,
 ) -> int:
     """Copy lines, with the fields of some columns replaced, until the end or until `out` is full.
 
@@ -203,6 +210,8 @@ def splice_rows(
     least : (K,) int64
         Decimals to write; more where the field had more.
     out : (capacity,) uint8
+    mark : int
+        Code of the decimal point, or comma.
 
     Returns
     -------
@@ -226,8 +235,8 @@ def splice_rows(
                         for byte in data[copied:first]:
                             out[at] = byte
                             at += 1
-                        digits = min(max(least[k], _decimals(data, first, last)), 15)
-                        at = _put_number(out, at, value, digits)
+                        digits = min(max(least[k], _decimals(data, first, last, mark)), 15)
+                        at = _put_number(out, at, value, digits, mark)
                         copied = last
                     k += 1
                 column += 1

@@ -4,47 +4,23 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from meshreg.errors import InputError
+from meshreg.io.directions import Directions, find_directions
 from meshreg.io.safe import decode_name
+from meshreg.io.xyz_columns import guess_names, meaning, sample_rows, split
 
 _HEAD = 1 << 20  # bytes looked at to understand the file
 _SAMPLE = 200  # lines
 _DELIMITERS = (";", "\t", ",", " ")
 _DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+(e[+-]?\d+)?", re.IGNORECASE)
 _SPACED_COMMAS = re.compile(r"[+-]?\d+,\d+(,\s+[+-]?\d+,\d+)+")  # "1,5, 2,5, 3,5"
-_NAMES = {
-    "x": ("x", "east", "easting", "e", "xcoord", "coordx", "coordinatex", "utmx", "utme"),
-    "y": ("y", "north", "northing", "n", "ycoord", "coordy", "coordinatey", "utmy", "utmn"),
-    "z": (
-        "z",
-        "up",
-        "u",
-        "elevation",
-        "elev",
-        "height",
-        "altitude",
-        "alt",
-        "h",
-        "zcoord",
-        "coordz",
-    ),
-    "depth": ("depth", "down", "waterdepth"),
-    "lon": ("lon", "long", "longitude"),
-    "lat": ("lat", "latitude"),
-    "r": ("r", "red", "rf", "diffusered"),
-    "g": ("g", "green", "gf", "diffusegreen"),
-    "b": ("b", "blue", "bf", "diffuseblue"),
-    "nx": ("nx", "normalx"),
-    "ny": ("ny", "normaly"),
-    "nz": ("nz", "normalz"),
-}
-_MEANING = {name: key for key, names in _NAMES.items() for name in names}
+_POINT = re.compile(r"[+-]?\d*\.\d*(e[+-]?\d+)?", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -58,8 +34,12 @@ class Layout:
     delimiter : str
         "," ";" tab, or " " for any run of blanks.
     columns : int
+    names : tuple of str
+        Of all columns: the header's, those said by the user, or guessed ones.
     where : dict
-        Column (from 0) of "x", "y", "z" and, where there are any, "r", "g", "b", "nx", "ny", "nz".
+        Column (from 0) of "x", "y", "z" and, where there are any, "r", "g", "b", "classification".
+    decimal : str
+        "." or ",", which stands in numbers.
     down : bool
         The third coordinate counts downward (a column called depth).
     lonlat : bool
@@ -67,28 +47,62 @@ class Layout:
     count : int or None
         Points announced in the first line (.pts).
     guessed : bool
-        No header says which columns are colours; `colors_at` looks at the values.
+        No header names the columns; they are known by their values.
     """
 
     start: int
     line: int
     delimiter: str
     columns: int
+    names: tuple[str, ...] = ()
     where: dict[str, int] = field(default_factory=dict)
+    decimal: str = "."
     down: bool = False
     lonlat: bool = False
     count: int | None = None
     guessed: bool = False
 
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What a user must know of how the file was understood."""
+        notes = []
+        if self.guessed and self.columns > 3:
+            notes.append(
+                f"Columns: {' '.join(self.names)} (guessed; a header line, or columns = [...] in "
+                "a .survey.toml, says otherwise)."
+            )
+        if self.decimal == ",":
+            notes.append("Numbers have decimal commas.")
+        return tuple(notes)
 
-def read_layout(data: NDArray[np.uint8], path: Path) -> Layout:
-    """Find out how a text cloud is written, from its first megabyte.
+    @property
+    def directions(self) -> Directions:
+        """The columns that turn with the survey; their names are made different by a number."""
+        coordinates = {self.names[k] for key, k in self.where.items() if len(key) == 1}
+        return find_directions(self.names, coordinates)
+
+    def column(self, name: str) -> int:
+        """Return the number of the first column of that name."""
+        return self.names.index(name)
+
+
+def read_layout(
+    data: NDArray[np.uint8], path: Path, columns: Sequence[str] | None = None
+) -> Layout:
+    """Find out how a text cloud is written, from its first megabyte and a sample of the rest.
+
+    Parameters
+    ----------
+    data : (size,) uint8
+    path : Path
+    columns : sequence of str, optional
+        Names of the columns, which go before a header's.
 
     Raises
     ------
     InputError
-        Binary, UTF-16, an ESRI grid, decimal commas, fewer than three columns, or a header
-        without x, y and z.
+        Binary, UTF-16, an ESRI grid, commas that both separate and are decimal, fewer than three
+        columns, or names without x, y and z.
     """
     head = bytes(data[:_HEAD])
     _refuse_binary(data, head, path)
@@ -108,7 +122,8 @@ def read_layout(data: NDArray[np.uint8], path: Path) -> Layout:
             continue
         rows = [line.strip() for _, line in lines[number - 1 :]][:_SAMPLE]
         rows = [row for row in rows if row and not row.startswith(("#", "//"))]
-        return _understand(rows, offset, number, comments, count, lines, path)
+        layout, header = _understand(rows, offset, number, comments, lines, path)
+        return _named(replace(layout, count=count), columns or header, data, path)
     raise InputError("holds no rows of numbers.", file=path, remedy="Export it again.")
 
 
@@ -140,37 +155,45 @@ def _understand(
     offset: int,
     number: int,
     comments: Sequence[str],
-    count: int | None,
     lines: Sequence[tuple[int, str]],
     path: Path,
-) -> Layout:
+) -> tuple[Layout, Sequence[str] | None]:
+    """Return where the rows start and how they are cut, and the header's names if any."""
     if re.match(r"ncols\s+\d+", rows[0], re.IGNORECASE):
         raise InputError(
             "is an ESRI grid.", file=path, remedy="Convert it: gdal_translate grid.asc dem.tif"
         )
-    header: list[str] | None = None
-    if not any(_is_number(word) for word in re.split(r"[\s,;]+", rows[0])):
-        if len(rows) < 2:
-            raise InputError("holds no rows of numbers.", file=path, remedy="Export it again.")
-        delimiter, columns = _delimiter(rows[1:], path)
-        header = split(rows[0], delimiter)
-        offset, number = lines[number][0], number + 1
-        rows = rows[1:]
-    else:
-        delimiter, columns = _delimiter(rows, path)
+    if any(_is_number(word) for word in re.split(r"[\s,;]+", rows[0])):
+        delimiter, columns, decimal = _delimiter(rows, path)
         words = [_names_in(comment) for comment in reversed(comments)]
         header = next((n for n in words if len(n) == columns and _has_xyz(n)), None)
+        return Layout(offset, number, delimiter, columns, decimal=decimal), header
+    if len(rows) < 2:
+        raise InputError("holds no rows of numbers.", file=path, remedy="Export it again.")
+    delimiter, columns, decimal = _delimiter(rows[1:], path)
+    layout = Layout(lines[number][0], number + 1, delimiter, columns, decimal=decimal)
+    return layout, split(rows[0], delimiter)
+
+
+def _named(
+    layout: Layout, header: Sequence[str] | None, data: NDArray[np.uint8], path: Path
+) -> Layout:
+    """Return the layout with names and meanings of its columns."""
     if header is None:
-        where = {name: k for k, name in enumerate("xyz")}
-        return Layout(offset, number, delimiter, columns, where, count=count, guessed=True)
-    if len(header) != columns:
+        rows = sample_rows(data, layout.start, layout.delimiter)
+        if layout.decimal == ",":
+            rows = [[word.replace(",", ".") for word in row] for row in rows]
+        names = guess_names(rows, layout.columns, intensity=path.suffix.lower() == ".pts")
+        where = {key: k for k, name in enumerate(names) if (key := meaning(name))}
+        return replace(layout, names=tuple(names), where=where, guessed=True)
+    if len(header) != layout.columns:
         raise InputError(
-            f"has {len(header)} names in its header, but {columns} values in a row.",
+            f"has {len(header)} names in its header, but {layout.columns} values in a row.",
             file=path,
-            place=f"line {number}",
+            place=f"line {layout.line}",
             remedy="Name every column; write numbers with a decimal point.",
         )
-    meanings = [_meaning(name) for name in header]
+    meanings = [meaning(name) for name in header]
     where = {key: meanings.index(key) for key in dict.fromkeys(meanings) if key}
     lonlat = not {"x", "y"} <= where.keys() and {"lon", "lat"} <= where.keys()
     down = "z" not in where and "depth" in where
@@ -186,7 +209,7 @@ def _understand(
         )
     for unused in ("lon", "lat", "depth"):
         where.pop(unused, None)
-    return Layout(offset, number, delimiter, columns, where, down, lonlat, count)
+    return replace(layout, names=tuple(header), where=where, down=down, lonlat=lonlat)
 
 
 def _names_in(comment: str) -> list[str]:
@@ -195,20 +218,8 @@ def _names_in(comment: str) -> list[str]:
 
 
 def _has_xyz(names: Sequence[str]) -> bool:
-    meanings = {_meaning(name) for name in names}
+    meanings = {meaning(name) for name in names}
     return {"x", "y"} <= meanings and bool({"z", "depth"} & meanings)
-
-
-def _meaning(name: str) -> str | None:
-    """Return what a column's name stands for; units in brackets and punctuation do not count."""
-    bare = re.sub(r"[\[(].*?[\])]", "", name).lower()
-    return _MEANING.get(re.sub(r"[^a-z]", "", bare))
-
-
-def split(line: str, delimiter: str) -> list[str]:
-    """Return the fields of a line without blanks and quotes around them."""
-    parts = line.split() if delimiter == " " else line.split(delimiter)
-    return [part.strip().strip("\"'") for part in parts]
 
 
 def _is_number(word: str) -> bool:
@@ -219,29 +230,31 @@ def _is_number(word: str) -> bool:
     return "_" not in word
 
 
-def _delimiter(rows: Sequence[str], path: Path) -> tuple[str, int]:
+def _delimiter(rows: Sequence[str], path: Path) -> tuple[str, int, str]:
     """Choose the delimiter that gives most rows the same number of columns, three of them numeric.
 
-    A later row of another width is found when all are read, with its line.
+    A later row of another width is found when all are read, with its line. Returns delimiter,
+    number of columns, and what stands in numbers as the decimal point.
     """
-    fits = []
+    fits: list[tuple[tuple[int, bool], tuple[str, int, str]]] = []
     for delimiter in _DELIMITERS if not _SPACED_COMMAS.fullmatch(rows[0]) else ():
-        widths = [len(split(row, delimiter)) for row in rows]
+        words = [split(row, delimiter) for row in rows]
+        widths = [len(row) for row in words]
         width = max(set(widths), key=widths.count)
-        example = split(rows[widths.index(width)], delimiter)
-        if sum(map(_is_number, example)) >= 3:
-            fits.append((widths.count(width), delimiter, width))
+        example = words[widths.index(width)]
+        every = [word for row in words for word in row]
+        commas = any(map(_DECIMAL_COMMA.fullmatch, every)) and not any(map(_POINT.fullmatch, every))
+        for decimal in (".", ",") if commas and delimiter != "," else (".",):
+            if sum(_is_number(word.replace(decimal, ".")) for word in example) >= 3:
+                fits.append(((widths.count(width), decimal == ","), (delimiter, width, decimal)))
     if fits:
-        best = max(fits, key=lambda fit: fit[0])
-        return best[1], best[2]
-    for delimiter in (";", "\t", " "):
-        words = [word.rstrip(",") for word in split(rows[0], delimiter)]
-        if sum(bool(_DECIMAL_COMMA.fullmatch(word)) for word in words) >= 2:
-            raise InputError(
-                "has numbers with a decimal comma.",
-                file=path,
-                remedy="Export it with decimal points (check the program's language setting).",
-            )
+        return max(fits, key=lambda fit: fit[0])[1]
+    if _SPACED_COMMAS.fullmatch(rows[0]):
+        raise InputError(
+            "has numbers with a decimal comma, and commas between them.",
+            file=path,
+            remedy="Export it with decimal points (check the program's language setting).",
+        )
     raise InputError(
         f"has no rows of three numbers or more; the first is {rows[0][:60]!r}.",
         file=path,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -14,21 +15,43 @@ from meshreg.types import Float64
 _UNSETTLED = 65_536
 
 
-def wanted_columns(layout: Layout) -> list[int]:
-    """Return the columns to parse: those with a meaning, or the first seven where it is guessed."""
-    if layout.guessed:
-        return list(range(min(layout.columns, 7)))
-    return sorted(set(layout.where.values()))
+def columns_of(
+    data: NDArray[np.uint8],
+    layout: Layout,
+    path: Path,
+    wanted: Iterable[int],
+    lenient: bool = False,
+) -> dict[int, Float64]:
+    """Parse some columns of all rows: each (rows,) float64, NaN where a field is empty or "nan".
 
-
-def read_values(data: NDArray[np.uint8], layout: Layout, path: Path) -> Float64:
-    """Parse all rows: (rows, columns of `wanted_columns`) float64, NaN where a field is no number.
+    Parameters
+    ----------
+    data : (size,) uint8
+    layout : Layout
+    path : Path
+    wanted : iterable of int
+        Numbers of columns.
+    lenient : bool
+        What is no number is NaN too, in columns that are not x, y or z.
 
     Raises
     ------
     InputError
         As `read`.
     """
+    if layout.decimal == ",":
+        data = data.copy()
+        data[layout.start :][data[layout.start :] == ord(",")] = ord(".")
+    numbers = sorted(set(wanted))
+    strict = {layout.where[name] for name in "xyz"} if lenient else set(numbers)
+    values = _read_values(data, layout, path, numbers, strict)
+    return {number: values[:, slot] for slot, number in enumerate(numbers)}
+
+
+def _read_values(
+    data: NDArray[np.uint8], layout: Layout, path: Path, wanted: list[int], strict: set[int]
+) -> Float64:
+    """Parse all rows into (rows, columns of `wanted`) float64."""
     from meshreg.io.xyz_kernels import count_rows, parse_rows
 
     rows = count_rows(data, layout.start)
@@ -39,7 +62,6 @@ def read_values(data: NDArray[np.uint8], layout: Layout, path: Path) -> Float64:
             place="line 1",
             remedy="It is cut off or was edited; export it again.",
         )
-    wanted = wanted_columns(layout)
     slots = np.full(layout.columns, -1, np.int64)
     slots[wanted] = np.arange(len(wanted))
     out = np.full((rows, len(wanted)), np.nan)
@@ -48,7 +70,8 @@ def read_values(data: NDArray[np.uint8], layout: Layout, path: Path) -> Float64:
     while state[0] < len(data):
         count, fields = parse_rows(data, state, ord(layout.delimiter), slots, out, unsettled)
         for row, slot, start, end, line in unsettled[:count].tolist():
-            out[row, slot] = _settled(bytes(data[start:end]), line, path)
+            word = bytes(data[start:end])
+            out[row, slot] = _settled(word, line, path, wanted[slot] in strict)
         if fields:
             raise InputError(
                 f"has {fields} values where the other rows have {layout.columns}.",
@@ -59,7 +82,7 @@ def read_values(data: NDArray[np.uint8], layout: Layout, path: Path) -> Float64:
     return out
 
 
-def _settled(word: bytes, line: int, path: Path) -> float:
+def _settled(word: bytes, line: int, path: Path, strict: bool) -> float:
     """Read a number that the kernel left to Python, or say which line has none."""
     text = word.decode("latin-1").strip("\"'")
     try:
@@ -67,6 +90,8 @@ def _settled(word: bytes, line: int, path: Path) -> float:
             return float(text)
     except ValueError:
         pass
+    if not strict:
+        return float("nan")
     comma = "a decimal comma" if "," in text else "text"
     raise InputError(
         f"has {comma} where a number should be: {text[:40]!r}.",

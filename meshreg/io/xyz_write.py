@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,15 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from meshreg.errors import OutputError, UsageError
+from meshreg.io.directions import bend_note, turn_columns
 from meshreg.io.mover import Mover
-from meshreg.io.rewriting import Extent, moved_points, require_unchanged
+from meshreg.io.rewriting import Extent, moved_points, require_unchanged, warn
 from meshreg.io.safe import atomic_file, file_bytes
-from meshreg.io.sidecar import write_shift
+from meshreg.io.sidecar import find_sidecar, write_shift
 from meshreg.io.xyz_layout import Layout, read_layout
-from meshreg.io.xyz_values import read_values, wanted_columns
+from meshreg.io.xyz_values import columns_of
 from meshreg.types import Float64, Frame, PointCloud, SourceFile, Survey
 
-_XYZ, _NORMAL = ("x", "y", "z"), ("nx", "ny", "nz")
+_XYZ = ("x", "y", "z")
 _BLOCK = 1 << 22
 
 
@@ -59,22 +61,21 @@ def write(survey: Survey, path: Path) -> tuple[Path, ...]:
                 if cloud.colors is not None:
                     part = np.hstack([part, cloud.colors[start : start + 100_000]])
                 stream.write("\n".join([row] * len(part)) % tuple(part.ravel().tolist()) + "\n")
-        _check(temporary, path, extent, 1e-6)
+        _check(temporary, path, extent, 1e-6, read_layout(file_bytes(temporary), path))
     frame = Frame(file_crs=survey.crs, crs=survey.crs)
     return (path, *write_shift(path, frame))
 
 
-def _check(written: Path, path: Path, extent: Extent, tolerance: float) -> Layout:
+def _check(written: Path, path: Path, extent: Extent, tolerance: float, layout: Layout) -> None:
+    """Read the coordinates back; a guess of columns is not made anew."""
     data = file_bytes(written)
-    layout = read_layout(data, path)
-    slot = {column: number for number, column in enumerate(wanted_columns(layout))}
-    values = read_values(data, layout, path)
-    extent.require_equal(values[:, [slot[layout.where[name]] for name in _XYZ]], path, tolerance)
-    return layout
+    values = columns_of(data, layout, path, [layout.where[name] for name in _XYZ])
+    points = np.stack([values[layout.where[name]] for name in _XYZ], axis=1)
+    extent.require_equal(points, path, tolerance)
 
 
 def rewrite(source: SourceFile, move: Mover, path: Path) -> tuple[Path, ...]:
-    """Write a moved copy of a text cloud: coordinates and normals change, every other word stays.
+    """Write a moved copy of a text cloud: coordinates and directions change, no other word does.
 
     Numbers keep at least the decimals that they had, and four (metres) or nine (degrees). A
     column called depth goes on counting downward.
@@ -90,10 +91,14 @@ def rewrite(source: SourceFile, move: Mover, path: Path) -> tuple[Path, ...]:
 
     require_unchanged(source, path)
     data = file_bytes(source.path)
-    layout = read_layout(data, source.path)
-    values = read_values(data, layout, source.path)
-    slot = {column: number for number, column in enumerate(wanted_columns(layout))}
-    points = values[:, [slot[layout.where[name]] for name in _XYZ]]
+    sidecar = find_sidecar(source.path)
+    said = None if sidecar is None else sidecar.columns
+    layout = read_layout(data, source.path, said)
+    found = layout.directions
+    turning = [layout.column(name) for name in found.columns]
+    xyz = [layout.where[name] for name in _XYZ]
+    values = columns_of(data, layout, source.path, [*xyz, *turning], lenient=True)
+    points = np.stack([values[column] for column in xyz], axis=1)
     moved = moved_points(move, points)
     lost = ~np.isfinite(points).all(axis=1)
     moved[lost] = np.nan  # such rows stay word for word
@@ -110,23 +115,23 @@ def rewrite(source: SourceFile, move: Mover, path: Path) -> tuple[Path, ...]:
     least = dict.fromkeys(replacing, 4)
     if degrees:
         least |= {layout.where["x"]: 9, layout.where["y"]: 9}
-    if set(_NORMAL) <= layout.where.keys():
-        vectors = values[:, [slot[layout.where[name]] for name in _NORMAL]]
-        turned = move.directions(points, vectors)
-        turned[lost] = np.nan
-        if flip:
-            turned[:, 2] *= -1
-        replacing |= {layout.where[name]: turned[:, k] for k, name in enumerate(_NORMAL)}
-        least |= {layout.where[name]: 6 for name in _NORMAL}
+    named = {name: values[layout.column(name)] for name in found.columns}
+    for name, column in turn_columns(found, move, points, named).items():
+        down = flip and any(name == group[2] for group in found.vectors)
+        replacing[layout.column(name)] = np.where(lost, np.nan, -column if down else column)
+        least[layout.column(name)] = 6
+    if note := bend_note(found, move):
+        warn(path, note)
     extent = Extent()
     extent.add(moved)
     with atomic_file(path) as temporary:
         with open(temporary, "wb") as stream:
             stream.write(_renamed(bytes(data[: layout.start]), names))
             stream.writelines(_moved_lines(data, layout, replacing, least))
-        again = _check(temporary, path, extent, 0.51e-4)
-    if again.columns != layout.columns or again.where != layout.where:
-        raise OutputError("does not read back with the same columns.", file=path)
+        again = read_layout(file_bytes(temporary), path, said)
+        if again.columns != layout.columns or again.decimal != layout.decimal:
+            raise OutputError("does not read back with the same columns.", file=path)
+        _check(temporary, path, extent, 0.51e-4, replace(layout, start=again.start))
     return (path,)
 
 
@@ -148,9 +153,12 @@ def _moved_lines(
     numbers = np.stack([replacing[column] for column in columns], axis=1)
     decimals = np.array([least[column] for column in columns], np.int64)
     state = np.array([layout.start, 0], np.int64)
+    mark = ord(layout.decimal)
     out = np.empty(_BLOCK, np.uint8)
     while state[0] < len(data):
-        size = splice_rows(data, state, ord(layout.delimiter), columns, numbers, decimals, out)
+        size = splice_rows(
+            data, state, ord(layout.delimiter), columns, numbers, decimals, out, mark
+        )
         if size == 0:
             out = np.empty(2 * len(out), np.uint8)
         yield out[:size].data

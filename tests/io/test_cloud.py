@@ -118,6 +118,34 @@ def test_withheld_and_noise_are_left_out_and_counted(tmp_path, form):
     assert survey.source[0].counts == {"points": 500, "used": 487}
 
 
+@pytest.mark.parametrize("suffix", [".las", ".laz"])
+def test_water_over_a_bed_is_left_out_and_counted(tmp_path, suffix):
+    classes = np.full(500, 40, np.uint8)
+    classes[100:300] = 41
+    classes[300:310], classes[310:315], classes[320:327] = 42, 45, 9
+    classes[330:340], classes[490:] = 18, 2
+    path = tmp_path / f"a{suffix}"
+    xyz = made(path, form=7, classification=classes)
+    survey = read_survey(path)
+    keep = np.isin(classes, (2, 40))
+    assert absolute(survey) == pytest.approx(xyz[keep], abs=2e-9)
+    assert survey.notes == (
+        "10 points classed as noise (7, 18) were left out.",
+        "222 points classed as water (9, 41, 42, 45) were left out; the bed is 40.",
+    )
+    files = rewrite_survey(survey, Transform(offset=(1, 2, 3)), tmp_path / "out")
+    again = laspy.read(files[0])  # the registered file keeps them all
+    assert (np.asarray(again.classification) == classes).all()
+    assert again.xyz == pytest.approx(xyz + (1, 2, 3), abs=5.1e-5)
+
+
+def test_nothing_but_water_is_refused_with_a_remedy(tmp_path):
+    made(tmp_path / "a.las", form=6, classification=np.full(500, 41, np.uint8))
+    with pytest.raises(InputError, match="500 points classed as water") as bad:
+        read_survey(tmp_path / "a.las")
+    assert "40 bed" in bad.value.remedy
+
+
 def test_nothing_but_noise_is_refused(tmp_path):
     made(tmp_path / "a.las", classification=np.full(500, 7, np.uint8))
     with pytest.raises(InputError, match="no usable point"):

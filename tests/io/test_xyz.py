@@ -136,7 +136,142 @@ def test_colours(tmp_path, name, rows, colors):
     assert (None if found is None else found.tolist()) == colors
     assert read_survey(path, geometry_only=True).geometry.colors is None
     if colors is not None and not any(c.isalpha() for c in rows[0]):
-        assert "were taken for red, green, blue" in survey.notes[0]
+        assert "red green blue" in survey.notes[0]
+
+
+RNG = np.random.default_rng(41)
+SHADE = RNG.integers(20, 230, 60)  # what the three channels of a picture have in common
+RGB = np.clip(SHADE[:, None] + RNG.integers(-8, 9, (60, 3)), 0, 255)
+NORMALS = RNG.normal((0, 0, 2), 1.0, (60, 3))
+NORMALS /= np.linalg.norm(NORMALS, axis=1, keepdims=True)
+PLACES = RNG.uniform(0, 20, (60, 3)).round(3)
+LIDAR = RNG.integers(0, 256, 60)  # knows nothing of the picture
+COLUMNS = {
+    "xyz": [[f"{v:.3f}" for v in row] for row in PLACES],
+    "rgb": [[f"{v}" for v in row] for row in RGB],
+    "rgb.0": [[f"{v}.000000" for v in row] for row in RGB],
+    "RGB": [[f"{257 * v}" for v in row] for row in RGB],
+    "rgbf": [[f"{v / 255:.6f}" for v in row] for row in RGB],
+    "n": [[f"{v:.6f}" for v in row] for row in NORMALS],
+    "i": [[f"{v}"] for v in LIDAR],
+    "-i": [[f"{v - 2048}"] for v in 16 * LIDAR],
+    "i.": [[f"{v / 7:.3f}"] for v in LIDAR],
+    "class": [[f"{v % 3 + 1}"] for v in LIDAR],
+    "alpha": [["255"]] * 60,
+    "id": [[f"{k}"] for k in range(7, 67)],
+    "label": [[f"P{k}"] for k in range(60)],
+}
+
+
+@pytest.mark.parametrize("delimiter", [" ", ";", "\t", ", "])
+@pytest.mark.parametrize(
+    ("parts", "names"),
+    [
+        ("xyz n", "x y z nx ny nz"),
+        ("xyz n rgb", "x y z nx ny nz red green blue"),
+        ("xyz rgb n", "x y z red green blue nx ny nz"),
+        ("xyz rgbf n", "x y z red green blue nx ny nz"),
+        ("xyz i n", "x y z other nx ny nz"),
+        ("xyz i rgb", "x y z intensity red green blue"),
+        ("xyz -i rgb n", "x y z intensity red green blue nx ny nz"),
+        ("xyz i. rgb", "x y z intensity red green blue"),
+        ("xyz rgb i", "x y z red green blue other"),
+        ("xyz rgb i.", "x y z red green blue other"),
+        ("xyz rgb class", "x y z red green blue other"),
+        ("xyz class rgb", "x y z intensity red green blue"),
+        ("xyz rgb alpha", "x y z red green blue other"),
+        ("xyz class i rgb alpha n", "x y z other other red green blue other nx ny nz"),
+        ("xyz i RGB", "x y z intensity red green blue"),
+        ("xyz rgb.0 i", "x y z red green blue other"),
+        ("id xyz rgb", "id x y z red green blue"),
+        ("label xyz i rgb", "id x y z intensity red green blue"),
+        ("id xyz n", "id x y z nx ny nz"),
+    ],
+)
+def test_columns_without_a_header_are_known_by_what_is_in_them(tmp_path, parts, names, delimiter):
+    table = zip(*(COLUMNS[part] for part in parts.split()), strict=True)
+    rows = [[word for part in row for word in part] for row in table]
+    path = text(tmp_path / "a.txt", "\n".join(delimiter.join(row) for row in rows))
+    survey = read_survey(path)
+    assert survey.notes[0].startswith(f"Columns: {names} (guessed")
+    assert absolute(survey) == pytest.approx(PLACES, abs=1e-12)
+    if "rgb" in parts.lower():
+        assert np.abs(survey.geometry.colors.astype(int) - RGB).max() == 0
+    else:
+        assert survey.geometry.colors is None
+    move = turned(0.7, offset=(1, 2, 3))
+    (written, *_) = rewrite_survey(survey, move, tmp_path / "out")
+    mark = "," if delimiter == ", " else delimiter
+    again = [fields_of(line, mark) for line in written.read_bytes().split(b"\n")]
+    for k, name in enumerate(names.split()):
+        column = [row[k].decode() for row in again]
+        if name in "xyz":
+            expected = move.apply(PLACES)[:, "xyz".index(name)]
+            assert np.array(column, float) == pytest.approx(expected, abs=5.1e-5)
+        elif name in ("nx", "ny", "nz"):
+            c, s = math.cos(0.7), math.sin(0.7)
+            x, y, z = NORMALS.T
+            expected = {"nx": c * x - s * y, "ny": s * x + c * y, "nz": z}[name]
+            assert np.array(column, float) == pytest.approx(expected, abs=2e-6)
+        else:
+            assert column == [row[k] for row in rows]
+
+
+def test_a_color_of_gray_noise_is_the_last_triple(tmp_path):
+    values = np.random.default_rng(1).integers(0, 256, (50, 4))
+    rows = [f"{k}.5 {k * k}.25 1.0 {' '.join(map(str, row))}" for k, row in enumerate(values)]
+    survey = read_survey(text(tmp_path / "a.xyz", "\n".join(rows)))
+    assert (survey.geometry.colors == values[:, 1:]).all()
+
+
+def test_names_of_columns_can_be_said(tmp_path):
+    path = text(tmp_path / "a.xyz", "1 2.5 3 10 20 30\n2 4 -5.5 1 2 3\n3 1 1 9 8 7\n")
+    text(tmp_path / "a.survey.toml", 'columns = ["id", "y", "x", "z", "q", "w"]')
+    survey = read_survey(path)
+    assert absolute(survey) == pytest.approx(np.array([[3, 2.5, 10], [-5.5, 4, 1], [1, 1, 9]]))
+    assert survey.geometry.colors is None
+    assert not any("guessed" in note for note in survey.notes)
+    text(tmp_path / "a.survey.toml", 'columns = ["x", "y", "z"]')
+    with pytest.raises(InputError, match="3 names in its header, but 6 values"):
+        read_survey(path)
+    text(tmp_path / "a.survey.toml", "columns = [1, 2, 3]")
+    with pytest.raises(InputError, match="a list of names"):
+        read_survey(path)
+
+
+@pytest.mark.parametrize(
+    ("head", "delimiter"), [("", ";"), ("", "\t"), ("", " "), ("X;Y;Z;R;G;B;Nx;Ny;Nz\n", ";")]
+)
+def test_decimal_commas_are_read_and_written(tmp_path, head, delimiter):
+    rows = [
+        ["731000,125", "5705000,5", "-12", "255", "0", "9", "0,6", "0,8", "0,0"],
+        ["731001", "5705003,25", "-13,5", "1", "2", "3", "0,0", "0,0", "1,0"],
+    ]
+    path = text(tmp_path / "a.csv", head + "".join(delimiter.join(row) + "\n" for row in rows))
+    survey = read_survey(path)
+    assert any("decimal commas" in note for note in survey.notes)
+    expected = np.array([[731000.125, 5705000.5, -12], [731001, 5705003.25, -13.5]])
+    assert absolute(survey) == pytest.approx(expected, abs=1e-9)
+    assert survey.geometry.colors.tolist() == [[255, 0, 9], [1, 2, 3]]
+    files = rewrite_survey(survey, turned(math.pi / 2, offset=(1, 2, 3)), tmp_path / "out")
+    moved = [
+        "-5704999,5000 731002,1250 -9,0000 255 0 9 -0,800000 0,600000 0,000000\n",
+        "-5705002,2500 731003,0000 -10,5000 1 2 3 0,000000 0,000000 1,000000\n",
+    ]
+    assert files[0].read_text() == head + "".join(moved).replace(" ", delimiter)
+
+
+def test_classes_of_noise_and_water_are_left_out(tmp_path):
+    rows = "".join(f"{k},{k * k},{k},{c}\n" for k, c in enumerate((1, 2, 7, 9, 40, 41, 42, 45, 18)))
+    survey = read_survey(text(tmp_path / "a.csv", "x,y,z,Classification\n" + rows))
+    assert absolute(survey)[:, 0].tolist() == [0, 1, 4]
+    assert survey.notes[0].startswith("2 points classed as noise")
+    assert survey.notes[1].startswith("4 points classed as water")
+    kept = read_survey(text(tmp_path / "b.csv", "x,y,z,class\n" + rows))  # a coral, perhaps
+    assert len(kept.geometry.points) == 9
+    with pytest.raises(InputError, match="no points that are ground") as bad:
+        read_survey(text(tmp_path / "c.csv", "x,y,z,classification\n1,2,3,41\n2,3,4,45\n"))
+    assert "40 bed" in bad.value.remedy
 
 
 # --- refusals and repairs
@@ -174,13 +309,8 @@ def test_strays_are_left_out_and_counted(tmp_path):
         ("1 2 3\n4 5 x6\n", "text where a number should be: 'x6'", "line 2"),
         ("1 2 3\n4 5 6_0\n", "text where a number", "line 2"),
         ("1 2 3\n4 5 0x10\n", "text where a number", "line 2"),
-        ("1 2 3\n4 5 6,5\n", "decimal comma", "line 2"),
-        ("1,5 2,5 3,5\n", "decimal comma", None),
-        ("1,5;2,5;3,5\n", "decimal comma", None),
-        ("1,5\t2,5\t3,5\n", "decimal comma", None),
+        ("1 2.5 3\n4 5 6,5\n", "decimal comma", "line 2"),
         ("1,5, 2,5, 3,5\n", "decimal comma", None),
-        ("x;y;z\n1,5;2,5;3,5\n", "decimal comma", None),
-        ("731000,12 5705000,5 3,0 255 0 0\n", "decimal comma", "line 1"),
         ("x,y,z\n1,5,2,5,3,5\n", "3 names in its header, but 6 values", "line 2"),
         ("1 2 3\n4 5 \x006\n", "NUL", "byte 10"),
         ("\ufeff1 2 3\n".encode("utf-16-le"), "UTF-16", None),
