@@ -136,7 +136,7 @@ def test_water_over_a_bed_is_left_out_and_counted(tmp_path, suffix):
     files = rewrite_survey(survey, Transform(offset=(1, 2, 3)), tmp_path / "out")
     again = laspy.read(files[0])  # the registered file keeps them all
     assert (np.asarray(again.classification) == classes).all()
-    assert again.xyz == pytest.approx(xyz + (1, 2, 3), abs=5.1e-5)
+    assert again.xyz == pytest.approx(np.add(xyz, (1, 2, 3)), abs=5.1e-5)
 
 
 def test_nothing_but_water_is_refused_with_a_remedy(tmp_path):
