@@ -29,7 +29,7 @@ Verdict = Literal["accepted", "review", "rejected"]
 # of places (N, 2): how far the ground there must go [m], (N, 2)
 OffsetAt = Callable[[Float64], Float64]
 
-_NOTHING: Mapping[str, Any] = MappingProxyType({})
+_NOTHING: Mapping[Any, Any] = MappingProxyType({})
 
 
 def _frozen(array: Any, dtype: Any, shape: tuple[int | None, ...], name: str) -> Any:
@@ -95,7 +95,8 @@ class SourceFile:
     """One file that a survey came from, as `meshreg.io` needs it to rewrite it.
 
     `companions` are the files it refers to (MTL, texture pages), in the order of reference;
-    `fingerprint` is (size in bytes, mtime in ns) when it was read.
+    `fingerprint` is (size in bytes, mtime in ns) when it was read. `copies` names the copies of
+    those companions that cannot keep their names beside the moved file (`meshreg.io.naming`).
     """
 
     path: Path
@@ -106,6 +107,7 @@ class SourceFile:
     sha256: str = ""
     fingerprint: tuple[int, int] = (0, 0)
     counts: Mapping[str, int] = field(default_factory=lambda: _NOTHING)
+    copies: Mapping[Path, str] = field(default_factory=lambda: _NOTHING)
 
 
 @dataclass(frozen=True, eq=False)

@@ -64,7 +64,7 @@ def register(request: RegisterRequest, voice: Voice, unfinished: Unfinished) -> 
 
 def register_into(folder: Path, request: RegisterRequest, progress: Progress) -> Registration:
     """Read, register, write everything into a folder that is there already."""
-    from meshreg.io import rewrite_survey, unchanged
+    from meshreg.io import require_writable, rewrite_survey, unchanged
     from meshreg.io.frames import common_crs
     from meshreg.types import Maps
 
@@ -84,6 +84,7 @@ def register_into(folder: Path, request: RegisterRequest, progress: Progress) ->
             LOG.warning("%s", note)
         manual, picked = read_manual(request.ties, reference, request.settings)
         notes += picked
+        require_writable(moving, reference)
         require_disk(folder, moving)
         pairing.require_memory((reference, moving), request.settings)
         reading = time.perf_counter() - clock

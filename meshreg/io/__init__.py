@@ -67,6 +67,13 @@ REWRITERS: dict[str, str] = {
     "colmap": "meshreg.io.colmap:rewrite",
     "maps": "meshreg.io.maps:rewrite",
 }
+# What is found out about a file before the work that could otherwise fail at its end.
+CHECKS: dict[str, str] = {
+    "glb": "meshreg.io.gltf_rewrite:require_writable",
+    "gltf": "meshreg.io.gltf_rewrite:require_writable",
+    "ply": "meshreg.io.ply_write:require_writable",
+    "colmap": "meshreg.io.colmap:require_writable",
+}
 
 
 def __getattr__(name: str) -> Any:
@@ -217,6 +224,29 @@ def require_warpable(survey: Survey) -> None:
     blocks.require_warpable(survey)
 
 
+def require_writable(survey: Survey, reference: Survey | None = None) -> None:
+    """Make sure that a survey's files can be written in the reference's coordinates.
+
+    It is asked before the work, so that nothing is refused at the end that could be refused at
+    the start. Room on the disk is not looked at.
+
+    Parameters
+    ----------
+    survey : Survey
+        The moving survey, as read from files, in the reference's CRS.
+    reference : Survey, optional
+        As for `rewrite_survey`.
+
+    Raises
+    ------
+    InputError
+        A file whose content, or whose way to the other CRS, cannot be written in its format.
+    """
+    from meshreg.io import blocks
+
+    blocks.require_writable(survey, reference)
+
+
 def unchanged(survey: Survey) -> None:
     """Make sure that a survey's files, and those they refer to, are still those that were read.
 
@@ -258,6 +288,7 @@ def same_files(reference: Survey, moving: Survey) -> str | None:
 
 
 __all__ = [
+    "CHECKS",
     "READERS",
     "REWRITERS",
     "WRITERS",
@@ -266,6 +297,7 @@ __all__ = [
     "read_registration",
     "read_survey",
     "require_warpable",
+    "require_writable",
     "rewrite_survey",
     "same_files",
     "unchanged",

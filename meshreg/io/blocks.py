@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import cast
 
+import numpy as np
+
 from meshreg.errors import InputError, OutputError, UsageError
-from meshreg.io import READERS, REWRITERS, load
+from meshreg.io import CHECKS, READERS, REWRITERS, load
 from meshreg.io.finding import Block, find_blocks
 from meshreg.io.frames import make_mover, registered_frame, to_file
-from meshreg.io.mover import is_plain
+from meshreg.io.mover import Mover, is_plain
+from meshreg.io.naming import Planned, planned
 from meshreg.io.options import ReadOptions
 from meshreg.io.safe import fingerprint, sha256
 from meshreg.io.sidecar import write_shift
-from meshreg.types import SourceFile, Survey, Transform, Warp
+from meshreg.types import Float64, Frame, SourceFile, Survey, Transform, Warp
 
-__all__ = ["Block", "find_blocks", "read_block", "require_warpable", "rewrite"]
+__all__ = ["Block", "find_blocks", "read_block", "require_warpable", "require_writable", "rewrite"]
 
 
 def read_block(block: Block, options: ReadOptions) -> Survey:
@@ -59,6 +63,45 @@ def require_warpable(survey: Survey) -> None:
             )
 
 
+def require_writable(survey: Survey, reference: Survey | None = None) -> None:
+    """Do `meshreg.io.require_writable`."""
+    for plan, mover in _plans(survey, Transform(), reference, "_registered"):
+        if (entry := CHECKS.get(plan.source.format)) is not None:
+            load(entry)(plan.source, mover, _sample(survey, plan.source))
+
+
+def _sample(survey: Survey, source: SourceFile) -> Float64:
+    """Return some of a survey's points (N, 3) in a file's own coordinates."""
+    points = getattr(survey.geometry, "points", np.empty((0, 3)))
+    some = points[:: max(1, len(points) // 1000)] + survey.origin
+    return to_file(_frame_of(source, survey), some) if len(some) else some
+
+
+def _frame_of(source: SourceFile, survey: Survey) -> Frame:
+    """Return a file's frame, leading to the CRS that its survey was taken to."""
+    start = source.frame
+    if start.crs is not None and survey.crs is not None and start.crs != survey.crs:
+        return replace(start, crs=survey.crs)
+    return start
+
+
+def _plans(
+    survey: Survey,
+    transform: Transform,
+    reference: Survey | None,
+    suffix: str,
+    warp: Warp | None = None,
+) -> Iterator[tuple[Planned, Mover]]:
+    """Give every file's source and new name with what moves it to its new frame."""
+    centre = transform.apply(survey.centre)
+    home = reference.source[0] if reference is not None and reference.source else None
+    for plan in planned(survey, suffix):
+        source = plan.source
+        target = registered_frame(home or source, source, centre=centre)
+        local = to_file(_frame_of(source, survey), survey.centre[None])[0]
+        yield plan, make_mover(source, transform, target, centre=local, warp=warp)
+
+
 def rewrite(
     survey: Survey,
     transform: Transform,
@@ -76,33 +119,12 @@ def rewrite(
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OutputError(f"cannot be made: {error.strerror}.", file=folder) from error
-    centre = transform.apply(survey.centre)
-    home = reference.source[0] if reference is not None and reference.source else None
     written: list[Path] = []
-    taken: set[str] = set()
-    for source in survey.source:
-        target = registered_frame(home or source, source, centre=centre)
-        start = source.frame
-        if start.crs is not None and survey.crs is not None and start.crs != survey.crs:
-            start = replace(start, crs=survey.crs)
-        local = to_file(start, survey.centre[None])[0]
-        mover = make_mover(source, transform, target, centre=local, warp=warp)
-        path = folder / _free_name(source.path, suffix, taken)
+    for plan, mover in _plans(survey, transform, reference, suffix, warp):
+        source, target = plan.source, mover.frame
+        path = folder / plan.name
         written += load(REWRITERS[source.format])(source, mover, path)
         if source.format != "maps":
             in_file = source.format == "e57" or (source.format == "las" and is_plain(target))
             written += write_shift(path, target, carries_crs=in_file)
     return tuple(dict.fromkeys(written))
-
-
-def _free_name(path: Path, suffix: str, taken: set[str]) -> str:
-    """Return a name for the moved file that no earlier block has."""
-    copc = path.name.lower().endswith(".copc.laz")  # its index does not survive; it becomes LAZ
-    stem, end = (path.name[: -len(".copc.laz")], ".laz") if copc else (path.stem, path.suffix)
-    name = f"{stem}{suffix}{end}"
-    for number in range(2, len(taken) + 3):
-        if name.lower() not in taken:
-            break
-        name = f"{stem}{suffix}_{number}{end}"
-    taken.add(name.lower())
-    return name

@@ -317,8 +317,7 @@ def rewrite(source: SourceFile, move: Mover, path: Path) -> tuple[Path, ...]:
     before, model = read_model(files)
     linear, shift = move.matrix[:3, :3], move.matrix[:3, 3]
     scale = float(np.cbrt(np.linalg.det(linear)))
-    if not scale > 0 or np.abs(linear @ linear.T / scale**2 - np.eye(3)).max() > 1e-4:
-        raise OutputError("would have to mirror or shear the model.", file=path)
+    require_writable(source, move, before.points[:: max(1, len(before.points) // 1000)])
     turn = pycolmap.Rotation3d(np.ascontiguousarray(_rotation(linear)))
     model.transform(pycolmap.Sim3d(scale, turn, np.ascontiguousarray(shift)))
     with atomic_folder(path) as folder:
@@ -333,6 +332,30 @@ def rewrite(source: SourceFile, move: Mover, path: Path) -> tuple[Path, ...]:
                 file=path,
             )
     return tuple(path / file.name for file in ModelFiles(path, files.suffix).paths)
+
+
+def require_writable(source: SourceFile, move: Mover, sample: Float64) -> None:
+    """Refuse a move that is no similarity, which is all that a model can make, before the work.
+
+    Raises
+    ------
+    InputError
+        It would have to be mirrored, sheared, or bent by over a millimetre by a change of CRS.
+    """
+    linear = move.matrix[:3, :3]
+    scale = float(np.cbrt(np.linalg.det(linear)))
+    similar = scale > 0 and np.abs(linear @ linear.T / scale**2 - np.eye(3)).max() <= 1e-4
+    moved = sample @ linear.T + move.matrix[:3, 3]
+    unit = float(np.cbrt(abs(np.linalg.det(move.frame.axes))))
+    off = float(np.abs(move.points(sample) - moved).max(initial=0)) * unit if len(sample) else 0.0
+    if not similar or not off < 1e-3:
+        what = f"bent by {off:.3g} m" if similar else "mirrored or sheared"
+        raise InputError(
+            f"would have to be {what} to be written in the reference's coordinates; a model moves "
+            "as a whole.",
+            file=source.path,
+            remedy="Give positions in the reference's CRS, or register the model's points (.ply).",
+        )
 
 
 def _rotation(linear: Float64) -> Float64:

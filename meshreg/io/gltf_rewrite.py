@@ -5,8 +5,10 @@ from __future__ import annotations
 import copy
 import json
 import struct
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import numpy as np
 
@@ -56,8 +58,11 @@ def rewrite(source: SourceFile, move: Mover, path: Path) -> tuple[Path, ...]:
     require_unchanged(source, path)
     document = read_document(source.path)
     points = read_geometry(document)
-    expected = _moved(document, move, points)
+    finite = np.flatnonzero(np.isfinite(points).all(axis=1))
+    require_writable(source, move, points[finite[:: max(1, len(finite) // 1000)]])
+    expected = points @ move.matrix[:3, :3].T + move.matrix[:3, 3]
     tree = _with_matrix(document, move.matrix)
+    _rename(document, source, tree)
     text = json.dumps(tree, ensure_ascii=False, allow_nan=False, separators=(",", ":")).encode()
     copies = copy_companions(source, path)
     with atomic_file(path) as temporary:
@@ -79,21 +84,39 @@ def rewrite(source: SourceFile, move: Mover, path: Path) -> tuple[Path, ...]:
     return (path, *copies)
 
 
-def _moved(document: Document, move: Mover, points: Float64) -> Float64:
-    """Move all points by the matrix, after making sure that it says what the mover does."""
-    moved = points @ move.matrix[:3, :3].T + move.matrix[:3, 3]
-    finite = np.flatnonzero(np.isfinite(points).all(axis=1))
-    sample = finite[:: max(1, len(finite) // 1000)]
-    off = np.abs(move.points(points[sample]) - moved[sample]).max() if len(sample) else 0.0
+def require_writable(source: SourceFile, move: Mover, sample: Float64) -> None:
+    """Refuse a file that would be bent on its way to the other CRS, which no node's matrix can.
+
+    Parameters
+    ----------
+    source : SourceFile
+    move : Mover
+    sample : (N, 3) float64
+        Some of its points, in its own coordinates.
+
+    Raises
+    ------
+    InputError
+        The bend is over 1 mm.
+    """
+    moved = sample @ move.matrix[:3, :3].T + move.matrix[:3, 3]
+    off = float(np.abs(move.points(sample) - moved).max(initial=0)) if len(sample) else 0.0
     off *= metres_per_file_unit(move)
     if not off <= _BENT:
         raise InputError(
             f"would be bent by {off:.3g} m on its way to the other CRS; the matrix of a glTF node "
             "cannot do that.",
-            file=document.path,
+            file=source.path,
             remedy="Convert it to .ply or .obj first.",
         )
-    return moved
+
+
+def _rename(document: Document, source: SourceFile, tree: dict[str, Any]) -> None:
+    """Let the tree refer to the copies of other files that cannot keep their names."""
+    for kind, index, uri in document.uris() if source.copies else ():
+        with suppress(InputError):  # a missing image is no companion
+            if (new := source.copies.get(document.outside(uri))) is not None:
+                tree[kind][index]["uri"] = quote(new)
 
 
 def _with_matrix(document: Document, matrix: Float64) -> dict[str, Any]:

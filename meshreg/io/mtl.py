@@ -81,10 +81,22 @@ def read_mtl(path: Path) -> dict[str, Material]:
             draft.place = f"line {number}"
             draft.page, draft.change, draft.clamp = _page(rest, path, draft.place)
         elif key.startswith(b"map_") or key.decode("latin-1") in _OTHER_MAPS:
-            draft.others.append(rest.split()[-1] if rest.startswith("-") else rest)
+            draft.others.append(_other(rest))
     if draft is not None:
         materials.setdefault(draft.name, draft.done())
     return materials
+
+
+def name_start(key: bytes, rest: bytes) -> int:
+    """Return where in what follows `key` (map_Kd, bump, ...) the name of the file begins."""
+    text = rest.decode("latin-1")
+    name = _page(text, Path(), "")[0] if key.lower() == b"map_kd" else _other(text)
+    return len(text) - len(name)
+
+
+def _other(text: str) -> str:
+    """Return the file that a map which is not used names, its options left out."""
+    return text.rsplit(maxsplit=1)[-1] if text.startswith("-") else text
 
 
 def _lines(path: Path) -> Iterator[tuple[int, bytes]]:

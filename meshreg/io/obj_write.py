@@ -16,6 +16,7 @@ from meshreg.errors import OutputError, UsageError
 from meshreg.io.images import texture_suffix, write_texture
 from meshreg.io.line_blocks import Block, in_order, line_blocks
 from meshreg.io.mover import Mover
+from meshreg.io.mtl_write import new_libraries, write_libraries
 from meshreg.io.obj_scan import scan
 from meshreg.io.rewriting import (
     Extent,
@@ -150,7 +151,8 @@ def rewrite(source: SourceFile, move: Mover, path: Path) -> tuple[Path, ...]:
     """Write a moved copy of an OBJ file: the numbers of `v` and `vn` change, no other byte.
 
     Numbers keep their decimals, and get six where they had fewer. The MTL and the texture pages
-    are copied under the same names.
+    are copied under the same names, or under those in `source.copies`: then the lines that name
+    them change, too.
 
     Parameters
     ----------
@@ -180,7 +182,8 @@ def rewrite(source: SourceFile, move: Mover, path: Path) -> tuple[Path, ...]:
                 out.write(_BOM)
             stream.seek(0)
             blocks = line_blocks(stream, source.path)
-            with closing(in_order(blocks, _mover_of_blocks(move, path), size)) as moved:
+            work = _mover_of_blocks(move, path, new_libraries(source))
+            with closing(in_order(blocks, work, size)) as moved:
                 for block, (text, points) in moved:
                     out.write(text.data)
                     parts.append(points)
@@ -193,7 +196,9 @@ def rewrite(source: SourceFile, move: Mover, path: Path) -> tuple[Path, ...]:
                 file=path,
                 remedy="Check the disk and run again.",
             )
-    return (path, *copy_companions(source, path))
+    copies = copy_companions(source, path, but=".mtl" if source.copies else "")
+    write_libraries(source, path)
+    return (path, *copies)
 
 
 def _read_back(path: Path) -> tuple[Float64, int]:
@@ -230,11 +235,19 @@ def _vectors(block: Block) -> tuple[UInt8, NDArray[np.int64], Float64, NDArray[n
     return kinds[:n], spans[:n], values[:n], decimals[:n]
 
 
-def _mover_of_blocks(move: Mover, path: Path) -> Callable[[Block], tuple[UInt8, Float64]]:
+def _mover_of_blocks(
+    move: Mover, path: Path, libraries: Callable[[bytes], bytes] | None = None
+) -> Callable[[Block], tuple[UInt8, Float64]]:
     """Return the function that moves one block: its new bytes, and its moved points."""
     from meshreg.io import obj_write_kernels as kernels
 
     def moved(block: Block) -> tuple[UInt8, Float64]:
+        text, points = placed(block)
+        if libraries is not None:
+            text = np.frombuffer(libraries(text.tobytes()), np.uint8)
+        return text, points
+
+    def placed(block: Block) -> tuple[UInt8, Float64]:
         kinds, spans, values, decimals = _vectors(block)
         n = len(kinds)
         if n == 0:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -25,14 +27,15 @@ from meshreg.io.rewriting import (
     require_unchanged,
     warn,
 )
-from meshreg.io.safe import atomic_file, file_bytes
+from meshreg.io.safe import atomic_file, file_bytes, resolve_reference
 from meshreg.io.sidecar import write_shift
-from meshreg.types import Frame, Mesh, PointCloud, SourceFile, Survey
+from meshreg.types import Float64, Frame, Mesh, PointCloud, SourceFile, Survey
 
 _CHUNK = 1 << 18  # rows
 _BLOCK = 1 << 24  # bytes
 _XYZ = ("x", "y", "z")
 _NORMAL = ("nx", "ny", "nz")
+_TEXTURE = re.compile(rb"(\s*comment\s+(?i:texturefile)\s+)(.*?)(\s*)", re.DOTALL)
 
 
 def write(survey: Survey, path: Path) -> tuple[Path, ...]:
@@ -154,17 +157,14 @@ def rewrite(source: SourceFile, move: Mover, path: Path) -> tuple[Path, ...]:
     data = file_bytes(source.path)
     table = read_tables(header, data, source.path, ("vertex",))["vertex"]
     if table.row is None:
-        raise InputError(
-            "has vertices with lists of varying length, which cannot be rewritten.",
-            file=source.path,
-            remedy="Export it without them.",
-        )
+        raise _lists(source)
     points = scalar_columns(table, _XYZ, np.float64)
     new = _with_enough_digits(table.element, move, points, path)
+    renamed = _renamed_pages(source, header)
     extent = Extent()
     with atomic_file(path) as temporary:
         with open(temporary, "wb") as stream:
-            stream.writelines(_moved_header(header, table.element, new))
+            stream.writelines(_moved_header(header, table.element, new, renamed))
             _copy(data, header.size, table.where[0], stream)
             moved = _moved_rows(table, move, points)
             if header.order:
@@ -172,8 +172,27 @@ def rewrite(source: SourceFile, move: Mover, path: Path) -> tuple[Path, ...]:
             else:
                 _write_text(table, bytes(data[slice(*table.where)]), moved, extent, stream)
             _copy(data, table.where[1], len(data), stream)
-        _check(temporary, header, extent, path)
+        _check(temporary, replace(header, textures=renamed), extent, path)
     return (path, *copy_companions(source, path))
+
+
+def require_writable(source: SourceFile, move: Mover, sample: Float64) -> None:
+    """Refuse a file whose vertices have lists of varying length, before the work."""
+    del move, sample
+    header = read_header(source.path)
+    vertex = next(element for element in header.elements if element.name == "vertex")
+    if vertex.has_lists:
+        data = file_bytes(source.path)
+        if read_tables(header, data, source.path, ("vertex",))["vertex"].row is None:
+            raise _lists(source)
+
+
+def _lists(source: SourceFile) -> InputError:
+    return InputError(
+        "has vertices with lists of varying length, which cannot be rewritten.",
+        file=source.path,
+        remedy="Export it without them.",
+    )
 
 
 def _with_enough_digits(
@@ -195,8 +214,27 @@ def _with_enough_digits(
     )
 
 
-def _moved_header(header: Header, old: Element, new: Element) -> list[bytes]:
+def _renamed_pages(source: SourceFile, header: Header) -> tuple[bytes, ...]:
+    """Return the names of the texture pages' copies, as far as they differ from the pages'."""
+    names = []
+    for name in header.textures:
+        new = None
+        with suppress(InputError):  # a missing page is no companion
+            folder = source.path.parent
+            new = source.copies.get(resolve_reference(folder, name, root=folder))
+        names.append(name if new is None else os.fsencode(new))
+    return tuple(names)
+
+
+def _moved_header(
+    header: Header, old: Element, new: Element, textures: tuple[bytes, ...]
+) -> list[bytes]:
     lines = list(header.lines)
+    if textures != header.textures:
+        pages = iter(textures)
+        for number, line in enumerate(lines):
+            if found := _TEXTURE.fullmatch(line):
+                lines[number] = found[1] + next(pages) + found[3]
     for before, after in zip(old.properties, new.properties, strict=True):
         if before.kind != after.kind:
             lines[before.line] = re.sub(

@@ -37,21 +37,30 @@ def require_unchanged(source: SourceFile, path: Path) -> None:
         )
 
 
-def copy_companions(source: SourceFile, path: Path) -> tuple[Path, ...]:
+def copy_companions(source: SourceFile, path: Path, *, but: str = "") -> tuple[Path, ...]:
     """Copy the files that a survey file refers to, to the same place beside the new one.
+
+    Those in `source.copies` get the name that stands there. With `but`, files of that suffix are
+    left to the caller (their names are returned all the same).
 
     Returns
     -------
     tuple of Path
         The copies.
     """
-    folder = source.path.parent
     copies = []
     for companion in source.companions:
-        target = path.parent / companion.relative_to(folder)
-        copy_file(companion, target)
+        target = path.parent / copy_name(source, companion)
+        if not but or companion.suffix.lower() != but:
+            copy_file(companion, target)
         copies.append(target)
     return tuple(copies)
+
+
+def copy_name(source: SourceFile, companion: Path) -> Path:
+    """Return where a companion's copy goes, from the moved file's folder."""
+    name = source.copies.get(companion)
+    return companion.relative_to(source.path.parent) if name is None else Path(name)
 
 
 def metres_per_file_unit(move: Mover) -> float:

@@ -1,0 +1,96 @@
+"""Names of the files that a moved survey is written to, all known before the first is written."""
+
+from __future__ import annotations
+
+import os
+import re
+import unicodedata
+from dataclasses import dataclass, replace
+from pathlib import Path, PurePosixPath
+
+from meshreg.io.safe import sha256
+from meshreg.types import SourceFile, Survey
+
+_LONGEST = 255  # bytes of a name, in every usual file system
+_ROOM = 40  # of them kept for "_registered", a number, a side file's suffix
+# What a result or a moved file's folder holds besides; a texture page must not be taken for it.
+_OURS = re.compile(
+    r"(?i)registration\.json|moved\.json|transform\w*\.txt|(reference|moving)_(dem|ortho)\.tif"
+    r"|report\.html|evidence\.npz|settings\.toml|log\.txt|manifest\S*|figures(/.*)?"
+)
+
+
+@dataclass(frozen=True)
+class Planned:
+    """A file to be written: `source` knows the names of its companions' copies."""
+
+    source: SourceFile
+    name: str
+
+
+def planned(survey: Survey, suffix: str) -> tuple[Planned, ...]:
+    """Return the name of every moved file; no two files of other content have one name.
+
+    A moved file is called as the source with `suffix`, and a number where an earlier block has
+    that name. Texture pages and material files keep their names; of two that would meet, the
+    later is called after its survey file, and what refers to it is rewritten.
+    """
+    plan = []
+    taken: set[str] = set()
+    copies: dict[str, Path] = {}  # folded name of a copy -> whose copy it is
+    names: dict[Path, PurePosixPath] = {}  # of each companion's copy
+    for source in survey.source:
+        name = _free_name(source.path, suffix, taken)
+        renamed: dict[Path, str] = {}
+        folder = source.path.parent
+        inside = [file for file in source.companions if file.is_relative_to(folder)]
+        # material files last: one that names a renamed page is a file of its own
+        for companion in sorted(inside, key=lambda file: file.suffix.lower() == ".mtl"):
+            place = PurePosixPath(companion.relative_to(folder).as_posix())
+            alone = companion.suffix.lower() == ".mtl" and bool(renamed)
+            target = names.get(companion, place)
+            stem = re.sub(r"[^A-Za-z0-9.-]+", "_", Path(name).stem)
+            number = 0
+            while not _may_be(target, companion, copies, alone):
+                number += 1
+                more = f"_{number}" if number > 1 else ""
+                target = place.with_name(f"{stem}{more}_{place.name}")
+            copies.setdefault(_folded(target), companion)
+            names[companion] = target
+            if target != place:
+                renamed[companion] = str(target)
+        plan.append(Planned(replace(source, copies=renamed), name))
+    return tuple(plan)
+
+
+def _may_be(target: PurePosixPath, companion: Path, copies: dict[str, Path], alone: bool) -> bool:
+    """Whether a copy may go to `target`: nothing else goes there, or (not `alone`) equal bytes."""
+    if _OURS.fullmatch(str(target)):
+        return False
+    other = copies.get(_folded(target))
+    if other is None or other == companion:
+        return True
+    if alone or other.stat().st_size != companion.stat().st_size:
+        return False
+    return sha256(other) == sha256(companion)
+
+
+def _folded(path: PurePosixPath | str) -> str:
+    """Return a name as file systems that fold letter case and normal form see it."""
+    return unicodedata.normalize("NFC", str(path)).casefold()
+
+
+def _free_name(path: Path, suffix: str, taken: set[str]) -> str:
+    """Return a name for the moved file whose stem, side files' too, no earlier block has."""
+    copc = path.name.lower().endswith(".copc.laz")  # its index does not survive; it becomes LAZ
+    stem, end = (path.name[: -len(".copc.laz")], ".laz") if copc else (path.stem, path.suffix)
+    room = _LONGEST - _ROOM - len(os.fsencode(suffix)) - len(os.fsencode(end))
+    while len(os.fsencode(stem)) > room:
+        stem = stem[:-1]
+    found = f"{stem}{suffix}"
+    for number in range(2, len(taken) + 3):
+        if _folded(found) not in taken:
+            break
+        found = f"{stem}{suffix}_{number}"
+    taken.add(_folded(found))
+    return found + end
