@@ -26,6 +26,13 @@ def as_output_error(path: Path) -> Iterator[None]:
         ) from error
 
 
+def short_name(name: str, most: int = 100) -> str:
+    """Return the beginning of a name, at most so many bytes of it."""
+    while len(os.fsencode(name)) > most:
+        name = name[:-1]
+    return name
+
+
 def _sync(path: Path) -> None:
     handle = os.open(path, os.O_RDONLY)
     try:
@@ -53,7 +60,8 @@ def atomic_file(path: Path) -> Iterator[Path]:
         For any OSError: full disk, no permission, no such folder.
     """
     path = Path(path)
-    temporary = path.with_name(f".{path.stem[:100]}.{secrets.token_hex(6)}.tmp{path.suffix}")
+    start = short_name(path.stem)
+    temporary = path.with_name(f".{start}.{secrets.token_hex(6)}.tmp{path.suffix}")
     with as_output_error(path):
         try:
             os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
@@ -94,7 +102,7 @@ def atomic_folder(
     path = Path(os.path.abspath(path))
     with as_output_error(path):
         _require_replaceable(path, overwrite, markers)
-    prefix = f".{path.name[:100]}.{hashlib.sha256(os.fsencode(path.name)).hexdigest()[:8]}"
+    prefix = f".{short_name(path.name)}.{hashlib.sha256(os.fsencode(path.name)).hexdigest()[:8]}"
     with as_output_error(path), _locked(path, path.with_name(prefix + ".lock")):
         _clear_leftovers(path, prefix)
         temporary = path.with_name(prefix + ".tmp")

@@ -339,7 +339,7 @@ def require_writable(source: SourceFile, move: Mover, sample: Float64) -> None:
 
     Raises
     ------
-    InputError
+    OutputError
         It would have to be mirrored, sheared, or bent by over a millimetre by a change of CRS.
     """
     linear = move.matrix[:3, :3]
@@ -349,10 +349,9 @@ def require_writable(source: SourceFile, move: Mover, sample: Float64) -> None:
     unit = float(np.cbrt(abs(np.linalg.det(move.frame.axes))))
     off = float(np.abs(move.points(sample) - moved).max(initial=0)) * unit if len(sample) else 0.0
     if not similar or not off < 1e-3:
-        what = f"bent by {off:.3g} m" if similar else "mirrored or sheared"
-        raise InputError(
-            f"would have to be {what} to be written in the reference's coordinates; a model moves "
-            "as a whole.",
+        what = f"bend the model by {off:.3g} m" if similar else "mirror or shear the model"
+        raise OutputError(
+            f"would have to {what} to be written in the reference's coordinates.",
             file=source.path,
             remedy="Give positions in the reference's CRS, or register the model's points (.ply).",
         )

@@ -8,6 +8,7 @@ import unicodedata
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 
+from meshreg.io.atomic import short_name
 from meshreg.io.safe import sha256
 from meshreg.types import SourceFile, Survey
 
@@ -43,13 +44,15 @@ def planned(survey: Survey, suffix: str) -> tuple[Planned, ...]:
         name = _free_name(source.path, suffix, taken)
         renamed: dict[Path, str] = {}
         folder = source.path.parent
-        inside = [file for file in source.companions if file.is_relative_to(folder)]
+        # a DEM is no companion that is copied with its orthomosaic, nor are a model's parts
+        copied = () if source.format in ("maps", "colmap") else source.companions
+        inside = [file for file in copied if file.is_relative_to(folder)]
         # material files last: one that names a renamed page is a file of its own
         for companion in sorted(inside, key=lambda file: file.suffix.lower() == ".mtl"):
             place = PurePosixPath(companion.relative_to(folder).as_posix())
             alone = companion.suffix.lower() == ".mtl" and bool(renamed)
             target = names.get(companion, place)
-            stem = re.sub(r"[^A-Za-z0-9.-]+", "_", Path(name).stem)
+            stem = re.sub(r"[^A-Za-z0-9.-]+", "_", short_name(Path(name).stem, 60))
             number = 0
             while not _may_be(target, companion, copies, alone):
                 number += 1
@@ -85,8 +88,7 @@ def _free_name(path: Path, suffix: str, taken: set[str]) -> str:
     copc = path.name.lower().endswith(".copc.laz")  # its index does not survive; it becomes LAZ
     stem, end = (path.name[: -len(".copc.laz")], ".laz") if copc else (path.stem, path.suffix)
     room = _LONGEST - _ROOM - len(os.fsencode(suffix)) - len(os.fsencode(end))
-    while len(os.fsencode(stem)) > room:
-        stem = stem[:-1]
+    stem = short_name(stem, room)
     found = f"{stem}{suffix}"
     for number in range(2, len(taken) + 3):
         if _folded(found) not in taken:
