@@ -15,12 +15,12 @@ from meshreg.errors import InputError
 from meshreg.io.frames import Placed, place
 from meshreg.io.options import ReadOptions
 from meshreg.io.polygons import usable_faces
-from meshreg.io.safe import fingerprint, sha256
+from meshreg.io.safe import FARTHEST, fingerprint, sha256
 from meshreg.types import Bool, Int32, Mesh, PointCloud, SourceFile, Survey, Texture, UInt8
 
 _LOG = logging.getLogger("meshreg")
 _MOST_LOST = 0.01  # share of points that may be NaN or infinite
-_LARGEST = 1e12  # coordinates beyond are damage: no unit makes the Earth that large
+FARTHEST_PAGE = 1e6  # texture coordinates from here on say nothing
 _MOST_WRAPPED = 0.01  # share of texture coordinates that may lie outside the page unsaid
 _SAMPLE = 500_000  # faces that the size of a pixel is measured on
 _AXES = np.eye(3)
@@ -186,9 +186,9 @@ def _keep_faces(raw: RawGeometry, keep: Bool) -> RawGeometry:
 def _without_lost_points(raw: RawGeometry, path: Path) -> tuple[RawGeometry, tuple[str, ...]]:
     """Leave out points that are not finite, and the faces that touch them."""
     # First the whole array at once, which is many times faster than row by row.
-    if len(raw.points) and raw.points.min() > -_LARGEST and raw.points.max() < _LARGEST:
+    if len(raw.points) and raw.points.min() > -FARTHEST and raw.points.max() < FARTHEST:
         return raw, ()
-    finite = _rows(np.abs(raw.points) < _LARGEST)
+    finite = _rows(np.abs(raw.points) < FARTHEST)
     lost = len(finite) - int(np.count_nonzero(finite))
     if not lost:
         return raw, ()
@@ -196,7 +196,7 @@ def _without_lost_points(raw: RawGeometry, path: Path) -> tuple[RawGeometry, tup
         first = int(np.flatnonzero(~finite)[0])
         raise InputError(
             f"has {lost} points of {len(finite)} that are not finite numbers below "
-            f"{_LARGEST:g} (more than {_MOST_LOST:.0%}).",
+            f"{FARTHEST:g} (more than {_MOST_LOST:.0%}).",
             file=path,
             place=f"vertex {first + 1}",
             remedy="Remove them in the program that made the file, or export it again.",
@@ -244,10 +244,32 @@ def _uv_notes(raw: RawGeometry) -> tuple[str, ...]:
     return (f"{share:.1%} of the texture coordinates lie outside 0-1 and wrap around.",)
 
 
+def require_pages_near(path: Path, uv: NDArray[np.float32]) -> None:
+    """Refuse texture coordinates (N, 2) of which over 1 % lie a million pages away or farther.
+
+    There a float32 no longer says which texel is meant.
+
+    Raises
+    ------
+    InputError
+    """
+    with np.errstate(invalid="ignore"):  # those that are no numbers count as none
+        far: Bool = np.asarray((np.abs(uv) >= FARTHEST_PAGE).any(axis=1) & _rows(np.isfinite(uv)))
+    count = int(np.count_nonzero(far))
+    if count > _MOST_LOST * len(far):
+        first = int(np.flatnonzero(far)[0])
+        raise InputError(
+            f"has {count} texture coordinates of {len(far)} beyond {FARTHEST_PAGE:g}, "
+            f"the first ({uv[first, 0]:g}, {uv[first, 1]:g}).",
+            file=path,
+            remedy="It is damaged; export it again, or read it with --geometry-only.",
+        )
+
+
 def without_broken_uv(
-    uv: NDArray[np.float32], face_texture: Int32
+    path: Path, uv: NDArray[np.float32], face_texture: Int32
 ) -> tuple[NDArray[np.float32], Int32, tuple[str, ...]]:
-    """Take the texture off faces whose texture coordinates are not finite.
+    """Take the texture off faces whose texture coordinates are not finite, or far off any page.
 
     Returns
     -------
@@ -256,14 +278,23 @@ def without_broken_uv(
     face_texture : (F,) int32
         -1 on those faces.
     notes : tuple of str
+
+    Raises
+    ------
+    InputError
+        As `require_pages_near`.
     """
-    good = _rows(np.isfinite(uv).reshape(len(uv), 6))
-    lost = int(np.count_nonzero(~good & (face_texture >= 0)))
+    with np.errstate(invalid="ignore"):
+        good = _rows((np.abs(uv) < FARTHEST_PAGE).reshape(len(uv), 6))
     if good.all():
         return uv, face_texture, ()
+    require_pages_near(path, uv[face_texture >= 0].reshape(-1, 2))
+    lost = int(np.count_nonzero(~good & (face_texture >= 0)))
     uv = np.where(good[:, None, None], uv, np.float32(0))
     face_texture = np.where(good, face_texture, np.int32(-1))
-    note = f"{lost} faces have texture coordinates that are not finite; they get no colour."
+    note = (
+        f"{lost} faces have texture coordinates that are not finite or far off; they get no colour."
+    )
     return uv, face_texture, (note,) if lost else ()
 
 

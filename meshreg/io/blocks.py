@@ -16,7 +16,7 @@ from meshreg.io.frames import make_mover, registered_frame, to_file
 from meshreg.io.mover import Mover, is_plain
 from meshreg.io.naming import Planned, planned
 from meshreg.io.options import ReadOptions
-from meshreg.io.safe import fingerprint, sha256
+from meshreg.io.safe import data_errors, fingerprint, sha256
 from meshreg.io.sidecar import write_shift
 from meshreg.types import Float64, Frame, SourceFile, Survey, Transform, Warp
 
@@ -36,7 +36,8 @@ def read_block(block: Block, options: ReadOptions) -> Survey:
             )
     is_file = block.path.is_file()
     before = fingerprint(block.path) if is_file else None
-    survey = cast(Survey, load(block.reader)(block.maps or block.path, options))
+    with data_errors(block.path):
+        survey = cast(Survey, load(block.reader)(block.maps or block.path, options))
     if block.note:
         survey = replace(survey, notes=(block.note, *survey.notes))
     if is_file and fingerprint(block.path) != before:
@@ -123,7 +124,8 @@ def rewrite(
     for plan, mover in _plans(survey, transform, reference, suffix, warp):
         source, target = plan.source, mover.frame
         path = folder / plan.name
-        written += load(REWRITERS[source.format])(source, mover, path)
+        with data_errors(source.path):
+            written += load(REWRITERS[source.format])(source, mover, path)
         if source.format != "maps":
             in_file = source.format == "e57" or (source.format == "las" and is_plain(target))
             written += write_shift(path, target, carries_crs=in_file)

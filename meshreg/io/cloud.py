@@ -19,6 +19,7 @@ from meshreg.io.cloud_write import rewrite, write
 from meshreg.io.frames import place
 from meshreg.io.las_header import LasHead, check_header, file_crs
 from meshreg.io.laz_chunks import las_errors
+from meshreg.io.laz_points import LazBackend
 from meshreg.io.options import ReadOptions
 from meshreg.io.safe import open_regular
 from meshreg.io.sidecar import find_sidecar
@@ -82,11 +83,16 @@ def read(path: Path, options: ReadOptions) -> Survey:
 
 @contextlib.contextmanager
 def opened(path: Path) -> Iterator[Any]:
-    """Give a laspy reader of a regular file whose header has been checked."""
+    """Give a laspy reader of a regular file whose header has been checked.
+
+    A chunk of points is good until the next one is read.
+    """
     import laspy
 
-    with open_regular(path) as stream, laspy.open(stream, closefd=False) as reader:
-        yield reader
+    with contextlib.ExitStack() as decoders, open_regular(path) as stream:
+        backend = LazBackend(path, decoders)
+        with laspy.open(stream, closefd=False, laz_backend=backend) as reader:
+            yield reader
 
 
 def chunk_points(record: int) -> int:

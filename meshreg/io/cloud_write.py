@@ -253,7 +253,12 @@ def _write_file(
             las_errors(path, OutputError),
             open(temporary, "r+b") as stream,
             laspy.open(
-                stream, mode="w", header=header, do_compress=compress, closefd=False
+                stream,
+                mode="w",
+                header=header,
+                do_compress=compress,
+                closefd=False,
+                encoding_errors="surrogateescape",  # names in Latin-1 stay as they are
             ) as writer,
         ):
             for rows in records:

@@ -71,7 +71,14 @@ def lonlat(value: str, x: float, y: float, z: float = 0.0) -> tuple[float, float
     if horizontal.is_geographic:
         lon, lat = x, y
     else:
-        mover = pyproj.Transformer.from_crs(horizontal, geographic, always_xy=True)
+        try:
+            mover = pyproj.Transformer.from_crs(horizontal, geographic, always_xy=True)
+        except pyproj.exceptions.ProjError as error:
+            raise InputError(
+                f"the coordinate reference system {crs_name(value)} cannot be worked with: "
+                f"{short(error).rstrip('.')}.",
+                remedy="It is damaged; state the right one in NAME.survey.toml (crs = ...).",
+            ) from error
         try:
             lon, lat = mover.transform(x, y, z, errcheck=True)[:2]
         except pyproj.exceptions.ProjError as error:

@@ -94,10 +94,10 @@ def _read_scans(
     path: Path, layout: Layout, geometry_only: bool, notes: list[str]
 ) -> tuple[Float64, UInt8 | None]:
     points, colors, invalid, empty = [], [], 0, 0
-    with opened(path) as (libe57, file):
+    with opened(path) as decoder:
         for number, scan in enumerate(layout.scans):
             found = 0
-            for xyz, rgb, kept, _ in pieces(libe57, file, number, scan, path):
+            for xyz, rgb, kept, _ in pieces(decoder, number, scan):
                 points.append(xyz[kept])
                 colors.append(None if rgb is None else rgb[kept])
                 found += len(kept)
@@ -175,9 +175,9 @@ def _is_rigid(path: Path, layout: Layout, move: Mover) -> bool:
     if np.abs(linear @ linear.T - np.eye(3)).max() > 1e-6 or np.linalg.det(linear) < 0:
         return False
     turn = _nearest_rotation(linear).as_matrix()
-    with opened(path) as (libe57, file):
+    with opened(path) as decoder:
         for number, scan in enumerate(layout.scans):
-            for xyz, _, kept, _ in pieces(libe57, file, number, scan, path):
+            for xyz, _, kept, _ in pieces(decoder, number, scan):
                 if kept.any():
                     corners = np.stack([xyz[kept].min(axis=0), xyz[kept].max(axis=0)])
                     place = linear @ scan.translation + move.matrix[:3, 3]
@@ -224,14 +224,15 @@ def _rewrite_poses(path: Path, layout: Layout, move: Mover, target: Path) -> Non
 
 def _rewrite_points(path: Path, layout: Layout, move: Mover, target: Path, shown: Path) -> None:
     crs = move.frame.file_crs
-    with opened(path) as (libe57, old), created(libe57, target, crs, shown) as new:
+    libe57 = library(path)
+    with opened(path) as old, created(libe57, target, crs, shown) as new:
         for number, scan in enumerate(layout.scans):
             extra = tuple(name for name in ("intensity",) if name in scan.fields)
             colors = COLORS if all(name in scan.fields for name in COLORS) else ()
             names = [*CARTESIAN, *colors, *extra]
             node = add_scan(libe57, new, f"scan {number + 1}", names)
             with writer(libe57, new, node, names) as put:
-                for piece in pieces(libe57, old, number, scan, path, extra):
+                for piece in pieces(old, number, scan, extra):
                     kept = piece.valid
                     data = dict(zip(CARTESIAN, move.points(piece.xyz[kept]).T, strict=True))
                     if piece.rgb is not None:
@@ -286,9 +287,9 @@ def _check(old_path: Path, new_path: Path, move: Mover, path: Path) -> None:
 def _valid_points(path: Path) -> Iterator[Float64]:
     """Give the valid points, a scan at a time."""
     layout = e57_xml.read_layout(path)
-    with opened(path) as (libe57, file):
+    with opened(path) as decoder:
         for number, scan in enumerate(layout.scans):
             waiting: list[Float64] = []
-            for xyz, _, kept, _ in pieces(libe57, file, number, scan, path):
+            for xyz, _, kept, _ in pieces(decoder, number, scan):
                 waiting.append(xyz[kept])
             yield np.concatenate(waiting) if waiting else np.zeros((0, 3))

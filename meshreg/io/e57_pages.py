@@ -8,32 +8,36 @@ from __future__ import annotations
 
 import struct
 from pathlib import Path
+from typing import BinaryIO
 
 from meshreg.errors import InputError, ResourceLimitError
-from meshreg.types import UInt8
 
 PAGE = 1024
 PAYLOAD = PAGE - 4
 MAX_XML = 100_000_000
 AGAIN = "The file is cut off or damaged; export or copy it again."
 _HEADER = struct.Struct("<8sIIQQQQ")
+HEADER_SIZE = _HEADER.size
 
 
-def check_header(data: UInt8, path: Path) -> tuple[int, int]:
-    """Return the XML section's physical offset and logical length."""
+def check_header(data: bytes, n_bytes: int, path: Path) -> tuple[int, int]:
+    """Return the XML section's physical offset and logical length.
+
+    `data` is the file's first `HEADER_SIZE` bytes of `n_bytes`.
+    """
 
     def refuse(message: str, remedy: str = AGAIN) -> InputError:
         return InputError(message, file=path, place="header", remedy=remedy)
 
-    if data.size < _HEADER.size or data[:8].tobytes() != b"ASTM-E57":
+    if len(data) < HEADER_SIZE or data[:8] != b"ASTM-E57":
         raise refuse("is not an E57 file (it does not start with ASTM-E57).")
-    _, major, _, size, start, length, page = _HEADER.unpack(data[:48].tobytes())
+    _, major, _, size, start, length, page = _HEADER.unpack(data)
     if major != 1:
         raise refuse(f"is E57 version {major}; version 1 is known.", "Export it as E57 1.0.")
     if page != PAGE:
         raise refuse(f"declares pages of {page} bytes; E57 1.0 has {PAGE}.")
-    if size != data.size or size % PAGE:
-        raise refuse(f"declares {size} bytes, but the file has {data.size}.")
+    if size != n_bytes or size % PAGE:
+        raise refuse(f"declares {size} bytes, but the file has {n_bytes}.")
     if start < _HEADER.size or start >= size or start % PAGE >= PAYLOAD:
         raise refuse(f"places its XML section at byte {start} of {size}.")
     if length > MAX_XML:
@@ -55,10 +59,12 @@ def to_physical(logical: int) -> int:
     return logical // PAYLOAD * PAGE + logical % PAYLOAD
 
 
-def logical_bytes(data: UInt8, start: int, length: int) -> bytes:
-    """Return payload bytes, checksums left out."""
+def logical_bytes(stream: BinaryIO, start: int, length: int) -> bytes:
+    """Return payload bytes, checksums left out; fewer than `length` where the file ends."""
     first, last = start // PAYLOAD, (start + length + PAYLOAD - 1) // PAYLOAD
-    payload = data[first * PAGE : last * PAGE].reshape(-1, PAGE)[:, :PAYLOAD].tobytes()
+    stream.seek(first * PAGE)
+    pages = stream.read((last - first) * PAGE)
+    payload = b"".join(pages[at : at + PAYLOAD] for at in range(0, len(pages), PAGE))
     return payload[start - first * PAYLOAD :][:length]
 
 

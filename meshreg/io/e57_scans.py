@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from meshreg.errors import InputError, MeshregError, OutputError
+from meshreg.io.decoding import Decoder
 from meshreg.io.e57_xml import Entry
 from meshreg.types import Bool, Float64, UInt8
 
@@ -21,6 +22,7 @@ CHUNK = 1_000_000
 CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
 SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
 COLORS = ("colorRed", "colorGreen", "colorBlue")
+_FIELDS = 8  # asked for at once, at most: coordinates, state, colours, intensity
 
 
 class MissingLibraryError(MeshregError):
@@ -43,27 +45,11 @@ def library(path: Path) -> Any:
 
 
 @contextmanager
-def _in_plain_words(libe57: Any, path: Path) -> Iterator[None]:
-    try:
-        yield
-    except (libe57.E57Exception, UnicodeDecodeError) as error:  # damage can stand in the message
-        raise InputError(
-            f"cannot be read: {str(error).splitlines()[0].strip()}.",
-            file=path,
-            remedy="The file is damaged; export or copy it again.",
-        ) from error
-
-
-@contextmanager
-def opened(path: Path) -> Iterator[tuple[Any, Any]]:
-    """Give (libe57, its image file); its exceptions become InputError in plain words."""
-    libe57 = library(path)
-    with _in_plain_words(libe57, path):
-        file = libe57.ImageFile(str(path), "r")
-        try:
-            yield libe57, file
-        finally:
-            file.close()
+def opened(path: Path) -> Iterator[Decoder]:
+    """Give the decoder of an E57 file: libE57Format in a process of its own."""
+    library(path)
+    with Decoder("e57", path, _FIELDS * 8 * CHUNK) as decoder:
+        yield decoder
 
 
 class Piece(NamedTuple):
@@ -79,7 +65,7 @@ class Piece(NamedTuple):
 
 
 def pieces(
-    libe57: Any, file: Any, number: int, scan: Entry, path: Path, extra: tuple[str, ...] = ()
+    decoder: Decoder, number: int, scan: Entry, extra: tuple[str, ...] = ()
 ) -> Iterator[Piece]:
     """Read a scan through its pose, at most `CHUNK` points at a time."""
     if scan.count == 0:
@@ -89,7 +75,7 @@ def pieces(
     if not all(name in scan.fields for name in coordinates):
         raise InputError(
             f"has no coordinates (its fields are {', '.join(scan.fields)}).",
-            file=path,
+            file=decoder.path,
             place=f"scan {number + 1}",
             remedy="Export it with cartesian or spherical coordinates.",
         )
@@ -97,39 +83,44 @@ def pieces(
     has_color = all(name in scan.fields for name in COLORS)
     names = [*coordinates, *([state] if state in scan.fields else []), *(COLORS * has_color)]
     rotation = rotation_matrix(scan.rotation)
-    with _in_plain_words(libe57, path):
-        for data in _raw(libe57, file, number, [*names, *extra], min(CHUNK, scan.count)):
-            local = np.stack([data[name] for name in coordinates], axis=1)
-            with np.errstate(all="ignore"):  # what is not finite is left out below
-                if spherical:
-                    local = cartesian(local)
-                xyz = local @ rotation.T + scan.translation
-            valid = np.asarray(np.isfinite(xyz).all(axis=1))
-            if state in data:
-                valid = valid & (data[state] == 0)
-            rgb = np.stack([data[name] for name in COLORS], axis=1) if has_color else None
-            yield Piece(
-                xyz,
-                None if rgb is None else _eight_bits(rgb, scan),
-                valid,
-                {name: data[name] for name in extra},
-            )
+    for data in _raw(decoder, number, [*names, *extra], min(CHUNK, scan.count)):
+        local = np.stack([data[name] for name in coordinates], axis=1)
+        with np.errstate(all="ignore"):  # what is not finite is left out below
+            if spherical:
+                local = cartesian(local)
+            xyz = local @ rotation.T + scan.translation
+        valid = np.asarray(np.isfinite(xyz).all(axis=1))
+        if state in data:
+            valid = valid & (data[state] == 0)
+        rgb = np.stack([data[name] for name in COLORS], axis=1) if has_color else None
+        yield Piece(
+            xyz,
+            None if rgb is None else _eight_bits(rgb, scan),
+            valid,
+            {name: data[name] for name in extra},
+        )
 
 
 def _raw(
-    libe57: Any, file: Any, number: int, names: list[str], capacity: int
+    decoder: Decoder, number: int, names: list[str], capacity: int
 ) -> Iterator[dict[str, Float64]]:
-    """Give the named fields of a scan as float64, `capacity` points at a time."""
-    arrays = {name: np.empty(capacity) for name in names}
-    buffers = libe57.VectorSourceDestBuffer()
-    for name, array in arrays.items():
-        buffers.append(libe57.SourceDestBuffer(file, name, array, capacity, True, True))
-    reader = file.root()["data3D"][number]["points"].reader(buffers)
-    try:
-        while count := reader.read():
-            yield {name: array[:count].copy() for name, array in arrays.items()}
-    finally:
-        reader.close()
+    """Give the named fields of a scan as float64, `capacity` points at a time.
+
+    They are good until the next ones are asked for.
+    """
+    decoder.place = f"scan {number + 1}"
+    decoder.ask("scan", number=number, names=names, capacity=capacity)
+    slot = 0
+    decoder.send("read", slot=slot)
+    while count := decoder.receive()["count"]:
+        decoder.send("read", slot=1 - slot)  # while these are worked on
+        try:
+            flat = np.frombuffer(decoder.slot(slot), np.float64, count * len(names))
+            yield dict(zip(names, flat.reshape(-1, count), strict=True))
+        except GeneratorExit:
+            decoder.receive()  # no more are wanted
+            raise
+        slot = 1 - slot
 
 
 def cartesian(rae: Float64) -> Float64:

@@ -6,6 +6,7 @@ first; and a registration only has to rewrite the poses in it, so every other by
 
 from __future__ import annotations
 
+import os
 import re
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,8 +15,16 @@ from xml.parsers import expat
 import numpy as np
 
 from meshreg.errors import InputError, UnsafeReferenceError
-from meshreg.io.e57_pages import AGAIN, PAGE, PAYLOAD, check_header, logical_bytes, to_logical
-from meshreg.io.safe import file_bytes
+from meshreg.io.e57_pages import (
+    AGAIN,
+    HEADER_SIZE,
+    PAGE,
+    PAYLOAD,
+    check_header,
+    logical_bytes,
+    to_logical,
+)
+from meshreg.io.safe import open_regular
 from meshreg.types import Float64
 
 MAX_DEPTH = 64
@@ -77,16 +86,19 @@ def read_layout(path: Path) -> Layout:
     ResourceLimitError
         An XML section over 100 MB.
     """
-    data = file_bytes(path)
-    start, length = check_header(data, path)
-    logical_start = to_logical(start)
-    xml = logical_bytes(data, logical_start, length)
+    with open_regular(path) as stream:
+        size = os.fstat(stream.fileno()).st_size
+        start, length = check_header(stream.read(HEADER_SIZE), size, path)
+        logical_start = to_logical(start)
+        xml = logical_bytes(stream, logical_start, length)
+    if len(xml) != length:
+        raise InputError("changed while it was read.", file=path, remedy="Read it again.")
     _refuse_declarations(xml, path)
     walk = _parse(xml, path)
-    is_last = (logical_start + length + PAYLOAD - 1) // PAYLOAD * PAGE >= data.size
+    is_last = (logical_start + length + PAYLOAD - 1) // PAYLOAD * PAGE >= size
     layout = Layout(xml, logical_start, is_last, tuple(walk.entries), walk.crs, walk.crs_span)
     for number, scan in enumerate(layout.scans):
-        _check_count(scan, number, data.size, path)
+        _check_count(scan, number, size, path)
     return layout
 
 

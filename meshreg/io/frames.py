@@ -7,6 +7,7 @@ coordinates are in.
 
 from __future__ import annotations
 
+import itertools
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -30,6 +31,7 @@ from meshreg.io.framing import ENU, NED, UNITS, Y_UP, frame_from
 from meshreg.io.mover import Mover, frame_matrix, make_mover, to_absolute, to_file
 from meshreg.io.options import ReadOptions
 from meshreg.io.precision import single_precision_note
+from meshreg.io.safe import FARTHEST
 from meshreg.io.sidecar import SidecarInfo, find_sidecar
 from meshreg.types import Float64, Frame, Maps, Mesh, PointCloud, SourceFile, Survey
 
@@ -97,6 +99,8 @@ def place(
     centre = np.median(xyz[:: max(1, len(xyz) // 10_000)].astype(np.float64), axis=0)
     try:
         frame = frame_from(options, sidecar, file_crs, default_axes, centre=centre)
+        corners = np.array(list(itertools.product(*ends.T)), float)
+        _require_near(to_absolute(frame, corners) if frame.is_linear else corners)
         origin = np.round(to_absolute(frame, centre[None])[0])
         points = _from_origin(frame, xyz, origin)
         notes += _frame_notes(options, sidecar, frame, centre)
@@ -107,6 +111,16 @@ def place(
         _LOG.warning("%s: %s", path.name, note)
     said = sidecar or SidecarInfo()
     return Placed(points, origin, frame, notes, said.path, said.name, said.date)
+
+
+def _require_near(corners: Float64) -> None:
+    """Refuse absolute coordinates (N, 3) at which float64 no longer tells millimetres apart."""
+    farthest = float(np.abs(corners).max())
+    if not farthest < FARTHEST:
+        raise InputError(
+            f"has coordinates of up to {farthest:.3g}, shift included; {FARTHEST:g} is the limit.",
+            remedy="Check its unit and its shift, or export it again.",
+        )
 
 
 def _ends(xyz: Any) -> Float64:

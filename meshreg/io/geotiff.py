@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from meshreg.errors import InputError, ResourceLimitError
+from meshreg.errors import InputError, MeshregError, ResourceLimitError
 from meshreg.io.crs import crs_text, mend_proj_data
-from meshreg.io.safe import beside, open_regular
+from meshreg.io.safe import FARTHEST, beside, open_regular
 from meshreg.types import Float64
 
 MAGIC = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
@@ -62,7 +62,12 @@ def opened(path: Path, max_pixels: int) -> Iterator[Any]:
             with dataset:
                 _check_size(dataset, path, max_pixels)
                 yield dataset
-        except RasterioError as error:
+        except MeshregError:
+            raise
+        except Exception as error:
+            # GDAL's own errors come through rasterio as they are, with no root of their own.
+            if not isinstance(error, RasterioError) and "rasterio" not in type(error).__module__:
+                raise
             cause = error.__cause__ or error
             raise InputError(
                 f"cannot be read: {_first_line(cause)}.",
@@ -135,6 +140,17 @@ def lattice(dataset: Any, path: Path) -> Float64:
         raise InputError(
             f"has a georeference that flattens its pixels ({matrix.tolist()}).",
             file=path,
+            remedy=EXPORT,
+        )
+    pixel = np.abs(matrix[:, :2]).sum(axis=0).min()
+    farthest = np.abs(matrix @ [*np.array(dataset.shape[::-1], float), 1.0]).max()
+    farthest = max(farthest, np.abs(matrix[:, 2]).max())
+    if not (farthest < FARTHEST and np.spacing(farthest) < 1e-3 * pixel):
+        raise InputError(
+            f"has pixels of {pixel:.3g} at coordinates of up to {farthest:.3g}, which cannot be "
+            "told apart there.",
+            file=path,
+            place="georeference",
             remedy=EXPORT,
         )
     return matrix

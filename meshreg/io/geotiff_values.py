@@ -19,7 +19,10 @@ from meshreg.io.geotiff import EXPORT, crs_of, lattice, opened, windows
 from meshreg.types import Bool, Float32, Float64, UInt8
 
 # Written without being declared, by Metashape, PDAL, ODM, CODEM, ASP, and as others' defaults.
-NODATA = (-9999.0, -10000.0, -32767.0, -32768.0, -99999.0, -1e6, -3.4028234663852886e38, 0.0)
+# The large positive ones are those of ESRI, Surfer and netCDF.
+_HUGE = (-3.4028234663852886e38, 3.4028234663852886e38, 1.70141e38, 9.969209968386869e36)
+NODATA = (-9999.0, -10000.0, -32767.0, -32768.0, -99999.0, -1e6, *_HUGE, 0.0)
+_HIGHEST = 1e9  # heights from here on are damage, in whatever unit
 NODATA_COLORS = (0, 255)
 
 
@@ -82,11 +85,27 @@ def read_height(path: Path, max_pixels: int) -> RawMap:
         unit = (dataset.units[0] or "").strip()
     values[~np.isfinite(values)] = np.nan
     _drop_undeclared(values, notes)
+    _require_heights(values, path)
     valid = np.isfinite(values)
     if not valid.any():
         raise InputError("holds no height: every cell is without data.", file=path, remedy=EXPORT)
     _warn_of_nodata_in_range(values, declared, scale, offset, notes)
     return RawMap(path, values, valid, matrix, crs, unit, tuple(notes))
+
+
+def _require_heights(values: Float32, path: Path) -> None:
+    """Refuse heights that no place has."""
+    with np.errstate(invalid="ignore"):
+        high = np.abs(values) >= _HIGHEST
+    count = int(np.count_nonzero(high))
+    if count:
+        row, col = (int(k) for k in np.argwhere(high)[0])
+        raise InputError(
+            f"has {count} heights of {_HIGHEST:g} or more, the first {values[row, col]:g}.",
+            file=path,
+            place=f"row {row + 1}, column {col + 1}",
+            remedy="Where they stand for no data, declare that value (gdal_edit.py -a_nodata).",
+        )
 
 
 def _drop_undeclared(values: Float32, notes: list[str]) -> None:

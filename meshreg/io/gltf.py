@@ -64,7 +64,7 @@ def read(path: Path, options: ReadOptions) -> Survey:
     document = read_document(path)
     notes = Notes()
     pages = Pages(document, options, notes.texts)
-    raw = _joined(read_parts(document, pages, notes), pages, notes)
+    raw = _joined(path, read_parts(document, pages, notes), pages, notes)
     counts = {"vertices": len(raw.points), "faces": 0 if raw.faces is None else len(raw.faces)}
     if raw.faces is not None and raw.colors is None:
         # Exporters repeat a vertex for each of its texture coordinates.
@@ -85,7 +85,7 @@ def read(path: Path, options: ReadOptions) -> Survey:
     return assemble_survey(path, raw, found, options)
 
 
-def _joined(parts: list[Part], pages: Pages, notes: Notes) -> RawGeometry:
+def _joined(path: Path, parts: list[Part], pages: Pages, notes: Notes) -> RawGeometry:
     """Put primitives together into one geometry."""
     points = np.concatenate([part.points for part in parts])
     colors = None
@@ -111,7 +111,7 @@ def _joined(parts: list[Part], pages: Pages, notes: Notes) -> RawGeometry:
         ]
     )[faces]
     page = np.concatenate([np.full(len(p.faces), p.page) for p in parts if p.faces is not None])
-    uv, page, more = without_broken_uv(uv, page.astype(np.int32))
+    uv, page, more = without_broken_uv(path, uv, page.astype(np.int32))
     notes.texts += more
     return RawGeometry(points, faces, colors, uv, page, tuple(pages.textures))
 

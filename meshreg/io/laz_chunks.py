@@ -7,13 +7,17 @@ Rust ends the process. LASzip: M. Isenburg, "LASzip: lossless compression of LiD
 from __future__ import annotations
 
 import contextlib
+import os
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from meshreg.errors import InputError, MeshregError
-from meshreg.io.safe import file_bytes, open_regular, require
+from meshreg.io.decoding import Decoder
+from meshreg.io.safe import open_regular, require
 
 DAMAGED = "The file is cut off or damaged; export or copy it again."
 _VARIABLE = 0xFFFFFFFF  # chunk size of COPC: each chunk has its own
@@ -67,8 +71,6 @@ def check_chunks(
     ------
     InputError
     """
-    import lazrs
-
     laszip = [item for item in vlrs if item.user == b"laszip encoded" and item.record == 22204]
     if not laszip or laszip[0].length < 34:
         raise InputError("has no LASzip record.", file=path, remedy=DAMAGED)
@@ -93,9 +95,9 @@ def check_chunks(
         (n_chunks,) = struct.unpack("<I", stream.read(4))
         require(n_chunks, record, table - start - 8, path, f"byte {table}", "chunks")
         _check_size(path, chunk, n_chunks, count)
-        stream.seek(start)
-        with las_errors(path):
-            chunks = lazrs.read_chunk_table(stream, lazrs.LazVlr(data))
+    with Decoder("laz", path, start=start, laszip=data.hex()) as decoder:
+        decoder.place = f"byte {table}"
+        chunks = decoder.ask("table")["chunks"]
     held = sum(n_bytes for _, n_bytes in chunks)
     points = sum(n for n, _ in chunks)
     if held > table - start - 8 or (chunk == _VARIABLE and points != count):
@@ -116,11 +118,14 @@ def _check_layers(path: Path, start: int, sizes: list[int], record: int, layers:
 
     A chunk starts with one whole point, the number of its points and the size of each layer.
     """
-    data = file_bytes(path)
     head = record + 4 + 4 * layers
-    for number, size in enumerate(sizes):
-        part = data[start + record + 4 : start + head]
-        inside = int(part.view("<u4").sum(dtype="u8")) if size >= head else size
+    with open_regular(path) as stream:
+        handle = stream.fileno()
+        starts = start + np.cumsum([0, *sizes[:-1]])
+        heads = [os.pread(handle, 4 * layers, at + record + 4) for at in starts.tolist()]
+    for number, (size, part) in enumerate(zip(sizes, heads, strict=True)):
+        whole = size >= head and len(part) == 4 * layers
+        inside = int(np.frombuffer(part, "<u4").sum(dtype="u8")) if whole else size
         if head + inside > size > 0:
             raise InputError(
                 f"has {inside} bytes of layers in chunk {number + 1} of {size} bytes.",
@@ -133,8 +138,6 @@ def _check_layers(path: Path, start: int, sizes: list[int], record: int, layers:
 
 def _table_start(handle: int, start: int, size: int) -> int:
     """Return where the chunk table is; a file that was written as a stream says it at its end."""
-    import os
-
     place = struct.unpack("<q", os.pread(handle, 8, start).ljust(8, b"\0"))[0]
     if place == -1:
         place = struct.unpack("<q", os.pread(handle, 8, size - 8).ljust(8, b"\0"))[0]

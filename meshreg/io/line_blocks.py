@@ -13,6 +13,7 @@ from typing import Any, BinaryIO, TypeVar
 import numpy as np
 
 from meshreg.errors import InputError, ResourceLimitError
+from meshreg.io.safe import read_into
 from meshreg.types import UInt8
 
 BLOCK = 1 << 19  # bytes read at once
@@ -64,7 +65,7 @@ def line_blocks(stream: BinaryIO, path: Path, hasher: Any = None) -> Iterator[Bl
         buffer = np.empty(len(carry) + BLOCK + PADDING, np.uint8)
         buffer[: len(carry)] = carry
         new = buffer[len(carry) : len(carry) + BLOCK]
-        n_read = stream.readinto(new.data)  # type: ignore[attr-defined]
+        n_read = read_into(stream, new, path)
         if hasher is not None:
             hasher.update(new[:n_read].data)
         size = len(carry) + n_read

@@ -14,7 +14,13 @@ from typing import Any
 import numpy as np
 
 from meshreg.errors import InputError, UnsafeReferenceError
-from meshreg.io.assemble import Found, RawGeometry, assemble_survey, eight_bit_colors
+from meshreg.io.assemble import (
+    Found,
+    RawGeometry,
+    assemble_survey,
+    eight_bit_colors,
+    require_pages_near,
+)
 from meshreg.io.images import open_texture
 from meshreg.io.mtl import Material, read_mtl
 from meshreg.io.obj_scan import Scan, line_of_face, scan
@@ -267,6 +273,7 @@ class _Drape:
 
         _require_range(self.path, found, found.uv, -1, len(found.uvs), "texture coordinate")
         n_faces = triangles.n_polygons
+        require_pages_near(self.path, found.uvs)
         starts = [at for at, _ in found.materials]
         slots = [self._slots.get(name, -1) for _, name in found.materials]
         slots = [slot if slot >= 0 and self._page[slot] >= 0 else -1 for slot in slots]

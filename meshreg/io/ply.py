@@ -103,7 +103,7 @@ def read(path: Path, options: ReadOptions) -> Survey:
         if uv is not None:
             textures, companions, new = _open_pages(header, path, options, notes)
             face_texture = new[pages]
-            uv, face_texture, more = without_broken_uv(uv, face_texture)
+            uv, face_texture, more = without_broken_uv(path, uv, face_texture)
             notes += more
     raw = RawGeometry(points, faces, colors, uv, face_texture, textures)
     found = Found("ply", tuple(notes), companions, counts)

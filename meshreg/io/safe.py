@@ -7,24 +7,33 @@ declared count through `require`; every writer goes through `atomic_file` or `at
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import hashlib
 import os
 import re
 import shutil
 import stat
+import struct
 import unicodedata
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
 
-from meshreg.errors import InputError, OutputError, UnsafeReferenceError
+from meshreg.errors import (
+    InputError,
+    MeshregError,
+    OutputError,
+    ResourceLimitError,
+    UnsafeReferenceError,
+)
 from meshreg.io.atomic import as_output_error, atomic_file, atomic_folder
 from meshreg.types import UInt8
 
 _SCHEME_OR_DRIVE = re.compile(r"[A-Za-z][A-Za-z0-9+.\-]*:")
+FARTHEST = 1e12  # coordinates from here on are damage: no unit makes the Earth that large
 _COPY_BESIDE = "Copy it beside the survey file and write its plain name there."
 
 
@@ -238,18 +247,79 @@ def _require_regular(mode: int, path: Path) -> None:
 
 
 def file_bytes(path: Path) -> UInt8:
-    """Map a whole file into memory, read-only: (size,) uint8.
+    """Read a whole file into memory: (size,) uint8, read-only.
+
+    It is read and not mapped: a page of a map that the file has lost since, as it was cut short
+    or its disk went away, ends the process by SIGBUS.
 
     Raises
     ------
     InputError
-        As `open_regular`, and for an empty file.
+        As `open_regular`; an empty file, and one that grows or shrinks while it is read.
+    ResourceLimitError
+        It is larger than the free memory.
     """
     with open_regular(path) as stream:
-        if os.fstat(stream.fileno()).st_size == 0:
+        size = os.fstat(stream.fileno()).st_size
+        if size == 0:
             raise InputError("is empty.", file=path, remedy="Export or copy it again.")
-        # A plain array over the map: slices of np.memmap are slow to make.
-        return np.asarray(np.memmap(stream, dtype=np.uint8, mode="r"))
+        free = free_memory()
+        if free is not None and size > free:
+            raise ResourceLimitError(
+                f"has {size / 1e9:.1f} GB; {free / 1e9:.1f} GB of memory are free.",
+                file=path,
+                remedy="Close other programs, or cut the survey into blocks.",
+            )
+        data = np.empty(size, np.uint8)
+        done = 0
+        while count := read_into(stream, data[done:], path):
+            done += count
+        if done < size or os.fstat(stream.fileno()).st_size != size:
+            raise InputError("changed while it was read.", file=path, remedy="Read it again.")
+        data.flags.writeable = False
+        return data
+
+
+def read_into(stream: BinaryIO, buffer: UInt8, path: Path) -> int:
+    """Fill a buffer from a stream; return the bytes read, 0 at its end.
+
+    Raises
+    ------
+    InputError
+        The system cannot read the file (a bad disk, a share that went away).
+    """
+    try:
+        return int(stream.readinto(buffer.data))  # type: ignore[attr-defined]
+    except OSError as error:
+        raise InputError(
+            f"cannot be read: {error.strerror}.", file=path, remedy="Check the disk or the share."
+        ) from error
+
+
+@contextlib.contextmanager
+def data_errors(path: Path) -> Iterator[None]:
+    """Turn errors that only values in a file bring about into an InputError that names it.
+
+    These are errors of arithmetic, of text and of the libraries of coordinate systems and
+    rasters; any other exception is a bug and stays one.
+    """
+    try:
+        yield
+    except MeshregError as error:
+        if isinstance(error, InputError | ResourceLimitError):
+            error.file = error.file or str(path)
+        raise
+    except Exception as error:
+        kinds = (ArithmeticError, UnicodeError, struct.error, np.linalg.LinAlgError)
+        library = type(error).__module__.partition(".")[0]
+        if not isinstance(error, kinds) and library not in ("pyproj", "rasterio"):
+            raise
+        said = (" ".join(str(error).split()) or type(error).__name__).rstrip(".")
+        raise InputError(
+            f"holds values that cannot be worked with: {said[:200]}.",
+            file=path,
+            remedy="The file is damaged; export or copy it again.",
+        ) from error
 
 
 def require(
@@ -337,16 +407,19 @@ def copy_file(source: Path, target: Path) -> None:
 
 
 __all__: list[str] = [
+    "FARTHEST",
     "MissingReferenceError",
     "atomic_file",
     "atomic_folder",
     "beside",
     "copy_file",
+    "data_errors",
     "decode_name",
     "file_bytes",
     "fingerprint",
     "free_memory",
     "open_regular",
+    "read_into",
     "require",
     "require_inside",
     "resolve_reference",

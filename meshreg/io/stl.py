@@ -124,6 +124,13 @@ def _text_corners(text: bytes, path: Path) -> Float64:
             place=f"byte {len(text)}",
             remedy=_DAMAGED,
         )
+    n_facets = len(words) // len(_WORDS)
+    if (found := sum(1 for _ in _TRIPLE.finditer(text))) != 4 * n_facets:
+        raise InputError(
+            f"has {n_facets} facets, but {found} lines of numbers; {4 * n_facets} belong to them.",
+            file=path,
+            remedy="Write each vertex and each normal on a line of its own; export it again.",
+        )
     numbers = []
     for facet in range(0, len(words), len(_WORDS)):
         for at in (8, 12, 16):
@@ -211,15 +218,24 @@ def rewrite(source: SourceFile, move: Mover, path: Path) -> tuple[Path, ...]:
 
 
 def _moved_text(text: bytes, move: Mover, corners: Float64) -> bytes:
-    """Replace the numbers after "vertex" and "facet normal"; the rest of the text stays."""
+    """Replace the numbers after "vertex" and "facet normal"; the rest of the text stays.
+
+    A normal that is no number (decimal commas, "-1.#IND") becomes that of its corners.
+    """
     new = iter(corners.tolist())
+    sides = np.diff(corners.reshape(-1, 3, 3), axis=1)
+    own = iter(np.cross(sides[:, 0], sides[:, 1]))
 
     def replaced(match: re.Match[bytes]) -> bytes:
         if match[2].lower() == b"vertex":
             values = next(new)
         else:
-            old = np.array([[float(word) for word in match[0].split()[2:]]])
-            values = move.directions(np.zeros((1, 3)), old)[0].tolist()
+            across = next(own)
+            try:
+                old = np.array([[float(word) for word in match[0].split()[2:]]])
+                values = move.directions(np.zeros((1, 3)), old)[0].tolist()
+            except ValueError:
+                values = (across / (np.linalg.norm(across) or 1.0)).tolist()
         return match[1] + " ".join(f"{value:.15g}" for value in values).encode()
 
     return _TRIPLE.sub(replaced, text)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections import deque
 from collections.abc import Generator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -57,11 +58,12 @@ def plan_pages(mesh: Mesh, used: Int32, sample: float) -> list[list[PagePlan]]:
     for index in used:
         texture, mine = mesh.textures[index], page == index
         size = median_texel(texel[mine], area[mine])
-        times = 1 if size is None else max(1, round(sample / size))
+        times = 1 if size is None else max(1, round(min(sample / size, max(texture.size))))
         low, high = spans[index]
         wraps = not texture.clamp and bool((low < -1e-4).any() or (high > 1 + 1e-4).any())
-        while wraps and any(length % times for length in texture.size):
-            times -= 1  # blocks must fit the period
+        if wraps:  # blocks must fit the period
+            period = math.gcd(*texture.size)
+            times = max(k for k in range(1, min(times, period) + 1) if period % k == 0)
         plan = PagePlan(int(index), texture, times, wraps)
         need = 4 * plan.stored[0] * plan.stored[1]
         if not groups or need > free:

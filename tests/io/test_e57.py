@@ -520,8 +520,8 @@ def test_intensity_survives_a_stretch(tmp_path, points):
     out = tmp_path / "o.e57"
     e57.rewrite(survey.source[0], make_mover(survey.source[0], STRETCH, Frame()), out)
     scan = e57_xml.read_layout(out).scans[0]
-    with e57_scans.opened(out) as (libe57, file):
-        pieces = list(e57_scans.pieces(libe57, file, 0, scan, out, ("intensity",)))
+    with e57_scans.opened(out) as decoder:
+        pieces = list(e57_scans.pieces(decoder, 0, scan, ("intensity",)))
     np.testing.assert_array_equal(pieces[0].extra["intensity"], bright)
 
 

@@ -210,7 +210,7 @@ def test_a_path_with_a_nul_byte_is_bad_input():
         open_regular(Path("a\0b"))
 
 
-def test_file_bytes_maps_and_is_read_only(tmp_path):
+def test_file_bytes_are_read_only(tmp_path):
     path = tmp_path / "x.bin"
     path.write_bytes(bytes(range(200)))
     data = file_bytes(path)

@@ -1,0 +1,229 @@
+"""Files that were made to harm, or damaged as no program would: refused by name, never worse."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import laspy
+import numpy as np
+import pytest
+import rasterio
+from rasterio import Affine
+
+from meshreg.errors import InputError
+from meshreg.io import cloud, decoding, read_survey, rewrite_survey, safe
+from meshreg.types import Transform
+
+DATA = Path(__file__).parent.parent / "data" / "hostile"
+MOVE = Transform(offset=np.array([1.5, -0.5, 0.25]))
+
+
+def refused(path: Path, *said: str) -> InputError:
+    with pytest.raises(InputError) as caught:
+        read_survey(path)
+    assert caught.value.file == str(path)
+    for text in said:
+        assert text in str(caught.value)
+    return caught.value
+
+
+# Native decoders
+
+
+def laz_of(path: Path, n: int) -> np.ndarray:
+    header = laspy.LasHeader(version="1.4", point_format=6)
+    header.scales, header.offsets = [0.001] * 3, [500_000, 4_000_000, 0]
+    rng = np.random.default_rng(7)
+    points = np.round(rng.uniform(0, 30, (n, 3)), 3) + header.offsets
+    record = laspy.ScaleAwarePointRecord.zeros(n, header=header)
+    record.x, record.y, record.z = points.T
+    with laspy.open(path, "w", header=header) as writer:
+        writer.write_points(record)
+    return points
+
+
+def test_a_decoder_that_overflows_its_stack_is_an_error():
+    error = refused(DATA / "overflow.laz", "the decoder crashed (SIGSEGV)")
+    assert error.place == "points 1 to 1000"
+
+
+def test_points_come_whole_and_in_order_through_the_decoder(tmp_path, monkeypatch):
+    points = laz_of(tmp_path / "a.laz", 10_007)
+    monkeypatch.setattr(cloud, "chunk_points", lambda record: 1_000)
+    survey = read_survey(tmp_path / "a.laz")
+    np.testing.assert_allclose(survey.geometry.points + survey.origin, points, atol=1e-6)
+
+
+def test_a_decoder_leaves_no_process_and_no_handle(tmp_path):
+    laz_of(tmp_path / "a.laz", 500)
+    before = set(os.listdir("/proc/self/fd"))
+    for _ in range(3):
+        read_survey(tmp_path / "a.laz")
+        with pytest.raises(InputError):
+            read_survey(DATA / "overflow.laz")
+    assert set(os.listdir("/proc/self/fd")) == before
+    children = Path(f"/proc/self/task/{os.getpid()}/children").read_text().split()
+    assert children == []
+
+
+def test_a_decoder_has_a_bound_on_its_memory(tmp_path, monkeypatch):
+    laz_of(tmp_path / "a.laz", 500)
+    monkeypatch.setattr(decoding, "_MEMORY", 1 << 20)
+    monkeypatch.setattr(decoding, "_PER_BYTE", 0)
+    refused(tmp_path / "a.laz", "cannot be decoded")
+
+
+# Files that change while they are read
+
+
+def test_a_file_cut_short_while_it_is_read_is_an_error(tmp_path, monkeypatch):
+    path = tmp_path / "a.xyz"
+    path.write_text("".join(f"{k % 50} {k // 50} {k % 7}\n" for k in range(5_000)))
+    plain = safe.read_into
+
+    def cut(stream, buffer, name):
+        os.truncate(name, 100)
+        return plain(stream, buffer, name)
+
+    monkeypatch.setattr(safe, "read_into", cut)
+    refused(path, "changed while it was read")
+
+
+def test_a_file_that_loses_its_end_later_does_not_end_the_process(tmp_path):
+    path = tmp_path / "a.bin"
+    path.write_bytes(b"\1" * 1_000_000)
+    program = (
+        "import os, sys; from pathlib import Path; from meshreg.io.safe import file_bytes\n"
+        "data = file_bytes(Path(sys.argv[1])); os.truncate(sys.argv[1], 0); print(data.sum())"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program, path], capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stdout.strip()) == (0, "1000000")
+
+
+# Numbers that nobody means
+
+
+@pytest.mark.parametrize("value", ["1e10", "-3e25", "2e6"])
+def test_texture_coordinates_far_off_are_refused_in_every_format(tmp_path, value):
+    from PIL import Image
+
+    Image.new("RGB", (32, 32), (90, 80, 70)).save(tmp_path / "t.png")
+    (tmp_path / "a.mtl").write_text("newmtl m\nmap_Kd t.png\n")
+    square = "v 0 0 0\nv 1 0 0.1\nv 1 1 0\nv 0 1 0.2\n"
+    (tmp_path / "a.obj").write_text(
+        f"mtllib a.mtl\n{square}vt 0 0\nvt {value} 0\nvt {value} 1\nvt 0 1\nusemtl m\n"
+        "f 1/1 2/2 3/3\nf 1/1 3/3 4/4\n"
+    )
+    (tmp_path / "a.ply").write_text(
+        "ply\nformat ascii 1.0\ncomment TextureFile t.png\nelement vertex 4\n"
+        "property float x\nproperty float y\nproperty float z\nelement face 2\n"
+        "property list uchar int vertex_indices\nproperty list uchar float texcoord\nend_header\n"
+        "0 0 0\n1 0 0.1\n1 1 0\n0 1 0.2\n"
+        f"3 0 1 2 6 0 0 {value} 0 {value} 1\n3 0 2 3 6 0 0 {value} 1 0 1\n"
+    )
+    for name in ("a.obj", "a.ply"):
+        refused(tmp_path / name, "texture coordinates", "beyond 1e+06")
+        assert len(read_survey(tmp_path / name, geometry_only=True).geometry.faces) == 2
+
+
+def tif(path: Path, heights: np.ndarray, transform: Affine, **more) -> Path:
+    with rasterio.open(
+        path, "w", driver="GTiff", width=heights.shape[1], height=heights.shape[0], count=1,
+        dtype="float32", transform=transform, **more,
+    ) as dataset:  # fmt: skip
+        dataset.write(heights.astype("float32"), 1)
+    return path
+
+
+@pytest.mark.parametrize("height", [1e20, -1e9, 3e12])
+def test_a_height_that_no_place_has_is_refused(tmp_path, height):
+    heights = np.add.outer(np.arange(12.0), np.arange(15.0))
+    heights[3, 4] = height
+    path = tif(tmp_path / "a.tif", heights, Affine(1e-5, 0, 144.9, 0, -1e-5, -38.2), crs=4326)
+    assert refused(path, "has 1 heights of 1e+09 or more").place == "row 4, column 5"
+
+
+@pytest.mark.parametrize("blank", [3.4028234663852886e38, 1.70141e38, 9.969209968386869e36])
+def test_blanks_of_other_programs_are_no_data(tmp_path, blank):
+    heights = np.add.outer(np.arange(12.0), np.arange(15.0))
+    heights[3, 4] = blank
+    path = tif(tmp_path / "a.tif", heights, Affine(1, 0, 10, 0, -1, 20))
+    survey = read_survey(path)
+    assert np.argwhere(~np.isfinite(survey.geometry.height)).tolist() == [[3, 4]]
+
+
+@pytest.mark.parametrize("north", [1e229, 1e15, 4e12])
+def test_a_georeference_that_tells_no_pixels_apart_is_refused(tmp_path, north):
+    path = tif(tmp_path / "a.tif", np.ones((9, 9)), Affine(0.5, 0, 0, 0, -0.5, north))
+    refused(path, "cannot be told apart")
+
+
+@pytest.mark.parametrize("shift", ["1e229 0 0", "0 -1e13 0", "0 0 1e300"])
+def test_a_shift_that_tells_no_points_apart_is_refused(tmp_path, shift):
+    path = tmp_path / "a.xyz"
+    path.write_text("0 0 0\n1 0 0\n0 1 0\n1 1 1\n")
+    (tmp_path / "a_offset.xyz").write_text(shift)
+    refused(path, "coordinates of up to", "shift included")
+
+
+def test_damage_that_gdal_raises_on_its_own_is_refused():
+    refused(DATA / "geokeys.tif", "cannot be read")
+
+
+def test_a_crs_that_proj_cannot_work_with_is_refused(tmp_path):
+    header = laspy.LasHeader(version="1.4", point_format=6)
+    header.scales = [0.001] * 3
+    header.global_encoding.wkt = True
+    header.vlrs.append(
+        laspy.vlrs.known.WktCoordinateSystemVlr(
+            'PROJCS["odd",GEOGCS["a",DATUM["b",SPHEROID["c",6378137,298.257222101]],'
+            'PRIMEM["Greenwich",0],UNIT["degree",0.0174532925199433]],'
+            'PROJECTION["No_Such_Way"],PARAMETER["false_easting",0],UNIT["metre",1]]'
+        )
+    )
+    record = laspy.ScaleAwarePointRecord.zeros(50, header=header)
+    record.x, record.y = np.arange(50.0) % 7, np.arange(50.0) // 7
+    with laspy.open(tmp_path / "a.las", "w", header=header) as writer:
+        writer.write_points(record)
+    refused(tmp_path / "a.las", "odd", "cannot be worked with")
+
+
+# Texts that are not plain
+
+
+def test_a_normal_with_a_decimal_comma_is_made_anew(tmp_path):
+    facet = "outer loop\nvertex {} 0 0\nvertex {} 1 0\nvertex 0 1 {}\nendloop\nendfacet\n"
+    (tmp_path / "a.stl").write_text(
+        f"solid x\nfacet normal 0 0 1\n{facet.format(0, 1, 0)}"
+        f"facet normal 0,5 0 1\n{facet.format(1, 1, 0.2)}endsolid x\n"
+    )
+    survey = read_survey(tmp_path / "a.stl")
+    files = rewrite_survey(survey, MOVE, tmp_path / "out")
+    lines = [line.split()[2:] for line in files[0].read_text().splitlines() if "normal" in line]
+    across = np.cross([0, 1, 0], [-1, 1, 0.2])
+    np.testing.assert_allclose(np.array(lines, float), [[0, 0, 1], across / np.linalg.norm(across)])
+
+
+def test_facets_on_one_line_are_refused_before_the_work(tmp_path):
+    (tmp_path / "a.stl").write_text(
+        "solid x\nfacet normal 0 0 1 outer loop vertex 0 0 0 vertex 1 0 0\nvertex 0 1 0\n"
+        "endloop endfacet\nendsolid x\n"
+    )
+    refused(tmp_path / "a.stl", "has 1 facets, but 2 lines of numbers")
+
+
+def test_software_named_in_latin1_is_written_as_it_was(tmp_path):
+    points = laz_of(tmp_path / "a.las", 60)
+    data = bytearray((tmp_path / "a.las").read_bytes())
+    name = "Vermessungsbüro Müller".encode("latin-1").ljust(32, b"\0")
+    data[58:90] = name
+    (tmp_path / "a.las").write_bytes(data)
+    files = rewrite_survey(read_survey(tmp_path / "a.las"), MOVE, tmp_path / "out")
+    assert files[0].read_bytes()[58:90] == name
+    again = np.column_stack([getattr(laspy.read(files[0]), axis) for axis in "xyz"])
+    np.testing.assert_allclose(again, points + MOVE.offset, atol=1e-3)
