@@ -29,20 +29,14 @@ _APT = {
     "libXrender.so.1": "libxrender1",
     "libexpat.so.1": "libexpat1",
 }
-# libusb comes with a Python package too; loading that copy first satisfies Open3D.
 _LIBUSB = """
-import ctypes
-try:
-    ctypes.CDLL("libusb-1.0.so.0")
-except OSError:
-    import libusb_package
-    ctypes.CDLL(str(libusb_package.get_library_path()), mode=ctypes.RTLD_GLOBAL)
+from meshreg.open3d_loading import load_libusb
+load_libusb()
 """
-_OPEN3D = (
-    _LIBUSB
-    + """
-import open3d
+_OPEN3D = """
+from meshreg.open3d_loading import load_open3d
 import numpy as np
+open3d = load_open3d()
 scene = open3d.t.geometry.RaycastingScene()
 corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float32)
 scene.add_triangles(corners, np.array([[0, 1, 2]], np.uint32))
@@ -50,7 +44,6 @@ hit = scene.cast_rays(np.array([[0.2, 0.2, 1, 0, 0, -1]], np.float32))
 assert abs(float(hit["t_hit"].numpy()[0]) - 1) < 1e-6
 print("Open3D", open3d.__version__)
 """
-)
 _OPENGL = """
 import pyvista
 plotter = pyvista.Plotter(off_screen=True, window_size=(64, 64))
@@ -253,7 +246,7 @@ def examine() -> tuple[Check, ...]:
         ),
         lambda: _probe(
             "Open3D",
-            "the rasterizer's independent check",
+            "refine.surfaces=gicp",
             _OPEN3D,
             needed=False,
             remedy="apt-get install libgl1 libegl1 libusb-1.0-0",

@@ -269,11 +269,12 @@ def _kept(transform: Transform, why: str) -> Polished:
 
 
 def _open3d() -> Any:
+    from meshreg.open3d_loading import load_open3d
+
     try:
-        import open3d
+        return load_open3d()
     except (ImportError, OSError) as error:
         raise UsageError(
             f"refine.surfaces is 'gicp', but Open3D cannot be imported: {error}.",
             remedy="Run `meshreg doctor` to see what is missing, or leave it at 'none'.",
         ) from error
-    return open3d

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -33,7 +34,8 @@ RULES: dict[str, set[str]] = {
     "dem_pair": BASE | {"ground"},
     "ground_plane": BASE | {"dem_pair", "ground", "sandwich"},
     "heights": BASE | {"dem_pair", "ground", "ground_plane"},
-    "surfaces": BASE | {"sandwich"},
+    "open3d_loading": set(),
+    "surfaces": BASE | {"open3d_loading", "sandwich"},
     "apply": BASE,
     "report": BASE,
     "held_out": BASE,
@@ -50,7 +52,7 @@ RULES: dict[str, set[str]] = {
     | {"calibration", "decision", "heading", "heights", "judge", "levels", "offsets", "raster"}
     | {"refine", "statistics", "surfaces", "voting", "warp", "warp_rasters"},
     "ties": BASE | {"io", "raster", "offsets", "statistics", "report"},
-    "doctor": set(),
+    "doctor": {"open3d_loading"},
 }
 FRONT = {"cli", "cli_parts", "benchmark", "selftest", "__init__", "__main__"}  # may import anything
 ESTIMATORS = {"sift", "terrain", "mutual_information"}
@@ -168,6 +170,22 @@ def test_heavy_libraries_are_imported_inside_functions(path: Path) -> None:
         assert not kernels or numba_home, (
             f"{path.relative_to(ROOT)}:{line} imports {module} (numba) at its top"
         )
+
+
+def test_open3d_is_imported_in_one_place() -> None:
+    """Anywhere else it fails on a machine without libusb, which its own developers never see."""
+    only = ROOT / "meshreg" / "open3d_loading.py"
+    # In text, not in syntax trees: code that a child process gets is a string.
+    importing = re.compile(
+        r"\b(import|from)\s+open3d\b|(import_module|__import__|importorskip)\(.open3d\b"
+    )
+    folders = ("meshreg", "data_synth", "tests", "scripts")
+    found = [path for folder in folders for path in modules(folder)]
+    assert {"meshreg/doctor.py", "scripts/bench_parts/peers.py", "tests/test_surfaces.py"} <= {
+        str(path.relative_to(ROOT)) for path in found
+    }
+    importers = [path for path in found if importing.search(path.read_text(encoding="utf-8"))]
+    assert importers == [only], "take meshreg.open3d_loading.load_open3d() instead"
 
 
 @pytest.mark.parametrize(

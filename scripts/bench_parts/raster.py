@@ -14,6 +14,7 @@ from typing import Any
 import measure
 import numpy as np
 
+from meshreg.open3d_loading import load_open3d
 from meshreg.raster import rasterize
 from meshreg.raster.mesh import draw_mesh
 from meshreg.raster.placing import place
@@ -51,8 +52,7 @@ def textured_reef(faces: int, page: int, size: float) -> Survey:
 
 def by_open3d(mesh: Mesh, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
     """Height and color of the first hit under each cell's centre: the peer's route."""
-    import open3d
-
+    open3d = load_open3d()
     scene = open3d.t.geometry.RaycastingScene()
     vertices = open3d.core.Tensor(mesh.vertices.astype(np.float32))
     scene.add_triangles(vertices, open3d.core.Tensor(mesh.faces.astype(np.uint32)))
@@ -122,27 +122,20 @@ def bench(
     work = f"{faces / 1e6:g} M triangles, {page}² texels, {cells * cells / 1e6:.0f} M cells"
     default, raster = row(work, "meshreg rasterize", partial(rasterize, survey, grid))
     default["note"] = f"{int(raster.samples.max())} samples a cell, floaters, masks, gaps"
-    rows = [default]
-    try:
-        import open3d  # noqa: F401
-    except ImportError as error:
-        default["note"] += f"; Open3D is not here: {error}"
-    else:
-        peer, (height, _) = row(
-            work,
-            "Open3D RaycastingScene + NumPy",
-            partial(by_open3d, mesh, grid),
-            times=3,
-        )
-        layers = draw_mesh(mesh, placing, grid, spacing, plain, times=1)
-        off = np.abs(height - layers.height - placing.datum)
-        off = off[np.isfinite(off)]
-        peer["note"] = (
-            f"1 ray a cell; {peer['seconds'] / default['seconds']:.1f} times as long; "
-            f"{np.count_nonzero(off > 1e-4)} of {off.size:,} heights differ by over 1e-4 m"
-        )
-        rows.append(peer)
-    return rows + bench_clouds(points, size)
+    peer, (height, _) = row(
+        work,
+        "Open3D RaycastingScene + NumPy",
+        partial(by_open3d, mesh, grid),
+        times=3,
+    )
+    layers = draw_mesh(mesh, placing, grid, spacing, plain, times=1)
+    off = np.abs(height - layers.height - placing.datum)
+    off = off[np.isfinite(off)]
+    peer["note"] = (
+        f"1 ray a cell; {peer['seconds'] / default['seconds']:.1f} times as long; "
+        f"{np.count_nonzero(off > 1e-4)} of {off.size:,} heights differ by over 1e-4 m"
+    )
+    return [default, peer, *bench_clouds(points, size)]
 
 
 def bench_clouds(points: int, size: float) -> list[dict[str, Any]]:

@@ -2,7 +2,8 @@
 
 A part is a module here with `bench() -> list of rows`; a row is a dict whose keys are the columns
 of the part's table, in order, or a tuple (what, seconds, note). The first line of the module's
-docstring is the table's title. A part that fails is a line in the table, not the end of the run.
+docstring is the table's title. What fails, a peer that is missing included, is a row with the key
+"failed": the other parts still run, but the exit code is 1, and BENCHMARKS.md stays as it was.
 """
 
 from __future__ import annotations
@@ -56,6 +57,12 @@ def table(rows: Sequence[Mapping[str, Any]]) -> str:
     return "\n".join(lines)
 
 
+def failure(part: str, row: Mapping[str, Any]) -> str:
+    """Say in one line what failed in which part, and why."""
+    what = next((str(value) for key, value in row.items() if key != "failed"), "")
+    return ": ".join(text for text in (part, what, str(row["failed"])) if text)
+
+
 def machine() -> str:
     name = platform.processor() or platform.machine()
     for line in Path("/proc/cpuinfo").read_text().splitlines():
@@ -79,12 +86,16 @@ def main() -> int:
         parser.error(f"no part {unknown[0]!r}; there are {', '.join(parts())}")
     sys.path[:0] = [str(HERE), str(ROOT)]
     on = machine()
-    sections = []
+    sections, failures = [], []
     for name in names:
         title, rows = rows_of(name)
+        failures += [failure(name, row) for row in rows if row.get("failed")]
         section = f"## {name}\n\n{title}\n\n{table(rows)}\n"
         print(section, flush=True)
         sections.append(section)
+    if failures:
+        print("failed:", *failures, sep="\n  ", file=sys.stderr)
+        return 1
     if chosen.write:
         command = " ".join(["scripts/bench", *chosen.part, "--write"])
         head = f"# Benchmarks\n\nMade by `{command}` on {on}.\n\n"

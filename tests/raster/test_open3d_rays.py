@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from reference_raster import several, sheet
 
+from meshreg.open3d_loading import load_open3d
 from meshreg.raster.mesh import draw_mesh
 from meshreg.raster.placing import place
 from meshreg.raster.spacing import Spacing
@@ -17,8 +18,7 @@ PLAIN = RasterSettings(fill_cells=0, remove_floaters=False)
 
 def ray_heights(mesh, grid):
     """Height of the first hit of a ray straight down through each cell's centre."""
-    import open3d
-
+    open3d = load_open3d()
     scene = open3d.t.geometry.RaycastingScene()
     vertices = open3d.core.Tensor(mesh.vertices.astype(np.float32))
     scene.add_triangles(vertices, open3d.core.Tensor(mesh.faces.astype(np.uint32)))

@@ -1,0 +1,81 @@
+"""Open3D loads without any package of the operating system: with the libusb of its wheel."""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from meshreg import open3d_loading
+from meshreg.open3d_loading import LIBUSB, load_libusb
+
+ROOT = Path(__file__).parent.parent
+LINUX = pytest.mark.skipif(sys.platform != "linux", reason="elsewhere Open3D brings its own libusb")
+
+
+@LINUX
+@pytest.mark.needs("open3d")
+def test_libusb_is_the_packages_also_where_the_system_has_one():
+    """So the developers' machines and CI run what a machine without libusb runs."""
+    code = (
+        "from meshreg.open3d_loading import load_open3d\n"
+        "print(load_open3d().__version__)\n"
+        "maps = [line.split()[-1] for line in open('/proc/self/maps') if 'libusb' in line]\n"
+        "print(*sorted(set(maps)), sep='\\n')\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", code],
+        capture_output=True, text=True, cwd=ROOT, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    _, *loaded = done.stdout.splitlines()
+    assert [Path(path).parent.name for path in loaded] == ["libusb_package"]
+
+
+@pytest.mark.parametrize("packaged", ["/nowhere/libusb.so", None])
+def test_the_systems_libusb_where_the_package_has_none_that_loads(monkeypatch, packaged):
+    asked = []
+
+    def load(name, mode):
+        asked.append((name, mode))
+        if name != LIBUSB:
+            raise OSError("GLIBC_9.99 not found")
+
+    monkeypatch.setitem(
+        sys.modules, "libusb_package", SimpleNamespace(get_library_path=lambda: packaged)
+    )
+    monkeypatch.setattr(open3d_loading.ctypes, "CDLL", load)
+    assert load_libusb() == LIBUSB
+    assert [name for name, _ in asked] == [name for name in (packaged, LIBUSB) if name]
+    assert {mode for _, mode in asked} == {ctypes.RTLD_GLOBAL}
+
+
+def test_without_any_libusb_the_library_is_named(monkeypatch):
+    def load(name, mode):
+        raise OSError(f"{name}: cannot open shared object file")
+
+    monkeypatch.setitem(sys.modules, "libusb_package", None)
+    monkeypatch.setattr(open3d_loading.ctypes, "CDLL", load)
+    with pytest.raises(OSError, match=LIBUSB):
+        load_libusb()
+
+
+@pytest.mark.needs("open3d")
+def test_the_command_polishes_on_surfaces_in_a_process_of_its_own(tmp_path):
+    """`refine.surfaces=gicp`, as a user runs it; what it gives is asserted in test_surfaces."""
+    data = ROOT / "meshreg" / "demo_data"
+    command = [
+        sys.executable, "-m", "meshreg", "register", data / "beach_2018.obj",
+        data / "beach_2019.obj", "-o", tmp_path / "out", "--search-radius", "20", "--geometry-only",
+        "--set", "refine.surfaces=gicp", "--json",
+    ]  # fmt: skip
+    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=False)
+    assert done.returncode in (0, 4), done.stderr + done.stdout
+    document = json.loads(done.stdout)
+    assert document["settings"]["refine"]["surfaces"] == "gicp"
+    print(document["notes"])
