@@ -866,6 +866,7 @@ def test_doctor_prints_the_command_that_helps(run: Run, monkeypatch: pytest.Monk
     assert machine.document(checks)["schema"] == "meshreg.doctor/1"
 
 
+@pytest.mark.needs("pycolmap")  # which is among the checks
 def test_doctor_examines_this_machine(run: Run) -> None:
     code, said, _ = run("doctor", "--json")
     checks = {check["name"]: check for check in json.loads(said)["checks"]}

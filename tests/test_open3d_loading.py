@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import json
 import subprocess
 import sys
 from pathlib import Path
@@ -63,19 +62,3 @@ def test_without_any_libusb_the_library_is_named(monkeypatch):
     monkeypatch.setattr(open3d_loading.ctypes, "CDLL", load)
     with pytest.raises(OSError, match=LIBUSB):
         load_libusb()
-
-
-@pytest.mark.needs("open3d")
-def test_the_command_polishes_on_surfaces_in_a_process_of_its_own(tmp_path):
-    """`refine.surfaces=gicp`, as a user runs it; what it gives is asserted in test_surfaces."""
-    data = ROOT / "meshreg" / "demo_data"
-    command = [
-        sys.executable, "-m", "meshreg", "register", data / "beach_2018.obj",
-        data / "beach_2019.obj", "-o", tmp_path / "out", "--search-radius", "20", "--geometry-only",
-        "--set", "refine.surfaces=gicp", "--json",
-    ]  # fmt: skip
-    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=False)
-    assert done.returncode in (0, 4), done.stderr + done.stdout
-    document = json.loads(done.stdout)
-    assert document["settings"]["refine"]["surfaces"] == "gicp"
-    print(document["notes"])
