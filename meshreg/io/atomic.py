@@ -52,7 +52,7 @@ def atomic_file(path: Path) -> Iterator[Path]:
     """Give a temporary path beside `path`; it becomes `path` when the block ends well.
 
     The temporary file exists (empty) and has the suffix of `path`. When the block raises, it is
-    removed and what was at `path` stays.
+    removed and what was at `path` stays. What a killed process left of its own is removed first.
 
     Raises
     ------
@@ -60,17 +60,56 @@ def atomic_file(path: Path) -> Iterator[Path]:
         For any OSError: full disk, no permission, no such folder.
     """
     path = Path(path)
-    start = short_name(path.stem)
-    temporary = path.with_name(f".{start}.{secrets.token_hex(6)}.tmp{path.suffix}")
     with as_output_error(path):
+        _clear_partial(path)
+        temporary, handle = _new_partial(path)
         try:
-            os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
             yield temporary
             _sync(temporary)
             os.replace(temporary, path)
             _sync_folder(path.parent)
         finally:
             temporary.unlink(missing_ok=True)
+            os.close(handle)
+
+
+def _new_partial(path: Path) -> tuple[Path, int]:
+    """Make an empty temporary file beside `path`; the lock says that its process lives."""
+    import fcntl  # POSIX only
+
+    before, after = _partial_name(path)
+    while True:
+        temporary = path.with_name(before + secrets.token_hex(6) + after)
+        handle = os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_RDWR | os.O_CLOEXEC, 0o666)
+        with contextlib.suppress(BlockingIOError):
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if temporary.exists():  # else another process took it for a dead one's, just now
+                return temporary, handle
+        os.close(handle)
+
+
+def _clear_partial(path: Path) -> None:
+    """Remove temporary files of `path` whose process was killed: nobody holds their lock."""
+    import fcntl  # POSIX only
+
+    before, after = _partial_name(path)
+    length = len(before) + 12 + len(after)
+    with contextlib.suppress(OSError):  # no such folder: told when the file is made
+        for name in os.listdir(path.parent):
+            if len(name) != length or not (name.startswith(before) and name.endswith(after)):
+                continue
+            with contextlib.suppress(OSError):
+                handle = os.open(path.with_name(name), os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC)
+                try:
+                    fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    os.unlink(path.with_name(name))
+                finally:
+                    os.close(handle)
+
+
+def _partial_name(path: Path) -> tuple[str, str]:
+    """Return what stands before and after the twelve random digits of a temporary file's name."""
+    return f".{short_name(path.stem)}.", f".tmp{path.suffix}"
 
 
 @contextlib.contextmanager
