@@ -71,7 +71,6 @@ REWRITERS: dict[str, str] = {
 CHECKS: dict[str, str] = {
     "glb": "meshreg.io.gltf_rewrite:require_writable",
     "gltf": "meshreg.io.gltf_rewrite:require_writable",
-    "ply": "meshreg.io.ply_write:require_writable",
     "colmap": "meshreg.io.colmap:require_writable",
 }
 

@@ -17,6 +17,7 @@ from meshreg.io.assemble import Found, placed_survey
 from meshreg.io.classes import BED, NOISE, OLD_WATER, RECLASS, WATER, class_notes, in_classes
 from meshreg.io.cloud_write import rewrite, write
 from meshreg.io.frames import place
+from meshreg.io.las_extra import extra_directions
 from meshreg.io.las_header import LasHead, check_header, file_crs
 from meshreg.io.laz_chunks import las_errors
 from meshreg.io.laz_points import LazBackend
@@ -60,6 +61,7 @@ def read(path: Path, options: ReadOptions) -> Survey:
     notes: list[str] = []
     with las_errors(path), opened(path) as reader:
         crs, unit = file_crs(reader.header, notes)
+        notes += extra_directions(reader.header.point_format).notes
         steps, colors, counts = _read_points(reader, path, head, options.geometry_only)
     notes += _drop_notes(counts)
     if not len(steps):

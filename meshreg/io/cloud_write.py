@@ -12,10 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from meshreg.errors import OutputError, UsageError
+from meshreg.io.directions import Directions, bend_note
+from meshreg.io.las_extra import extra_directions, turn_extra
 from meshreg.io.las_header import CRS_RECORDS, check_header
 from meshreg.io.laz_chunks import las_errors
 from meshreg.io.mover import Mover, is_plain
-from meshreg.io.rewriting import require_unchanged
+from meshreg.io.rewriting import require_unchanged, warn
 from meshreg.io.safe import atomic_file
 from meshreg.types import Float64, PointCloud, SourceFile, Survey
 
@@ -24,11 +26,6 @@ _STEP = 1e-4  # [m or ft]; in degrees 1e-9, which is as much
 _CHUNK = 500_000
 _LOST = np.iinfo(np.int32).min
 _WAVEFORMS = 65535  # record of the waveform packets
-_NORMALS = (
-    ("NormalX", "NormalY", "NormalZ"),
-    ("nx", "ny", "nz"),
-    ("normal_x", "normal_y", "normal_z"),
-)
 
 
 def write(survey: Survey, path: Path) -> tuple[Path, ...]:
@@ -79,7 +76,7 @@ def rewrite(source: SourceFile, move: Mover, path: Path) -> tuple[Path, ...]:
     """Write a moved copy of a LAS or LAZ file.
 
     Point format, extra dimensions, VLRs and EVLRs stay; X, Y, Z change, with steps of 0.0001 from
-    the centre of the new bounds, and so do normals that CloudCompare stores as extra dimensions.
+    the centre of the new bounds, and so do normals and other directions in extra dimensions.
     The CRS is replaced where it changes, and left out where the coordinates are local to a shift
     or turned (a sidecar then says it). A COPC index and waveforms inside the file do not survive.
     Every record is read back.
@@ -114,12 +111,14 @@ def rewrite(source: SourceFile, move: Mover, path: Path) -> tuple[Path, ...]:
         header.global_encoding.waveform_data_packets_internal = False
         header.start_of_waveform_data_packet_record = 0
     header.evlrs = None
-    normals = _normal_names(header)
+    found = extra_directions(header.point_format)
+    if note := bend_note(found, move):
+        warn(path, note)
 
     def records() -> Iterator[NDArray[Any]]:
         with las_errors(source.path), opened(source.path) as reader:
             for chunk in reader.chunk_iterator(_CHUNK):
-                yield _moved_rows(chunk, move, header, normals)
+                yield _moved_rows(chunk, move, header, found)
 
     _write_file(path, header, records(), evlrs, ends)
     return (path,)
@@ -148,16 +147,13 @@ def _file_points(chunk: Any) -> tuple[NDArray[np.bool_], Float64]:
     return (raw == _LOST).any(axis=1), raw * chunk.scales + chunk.offsets
 
 
-def _moved_rows(chunk: Any, move: Mover, header: Any, normals: tuple[str, ...]) -> NDArray[Any]:
+def _moved_rows(chunk: Any, move: Mover, header: Any, found: Directions) -> NDArray[Any]:
     rows: NDArray[Any] = chunk.array.copy()
     lost, points = _file_points(chunk)
     moved = np.full(points.shape, float(_LOST))
     moved[~lost] = np.rint((move.points(points[~lost]) - header.offsets) / header.scales)
     _put(rows, moved)
-    if normals:
-        vectors = np.stack([np.asarray(chunk[name], float) for name in normals], axis=1)
-        for name, values in zip(normals, move.directions(points, vectors).T, strict=True):
-            rows[name] = values
+    turn_extra(found, move, chunk, rows, points)
     if "x_t" in (rows.dtype.names or ()):
         # Waveform rays: not normalised, so the linear part as it is.
         names = ("x_t", "y_t", "z_t")
@@ -170,19 +166,6 @@ def _moved_rows(chunk: Any, move: Mover, header: Any, normals: tuple[str, ...]) 
 def _put(rows: NDArray[Any], steps: Float64) -> None:
     for axis, name in enumerate("XYZ"):
         rows[name] = steps[:, axis].astype(np.int32)
-
-
-def _normal_names(header: Any) -> tuple[str, ...]:
-    """Return the names of three plain float extra dimensions that hold a normal, or none."""
-    extra = {
-        item.name.lower(): item
-        for item in header.point_format.extra_dimensions
-        if item.kind.name == "FloatingPoint" and item.num_elements == 1 and not item.is_scaled
-    }
-    for names in _NORMALS:
-        if all(name.lower() in extra for name in names):
-            return tuple(extra[name.lower()].name for name in names)
-    return ()
 
 
 def _set_steps(header: Any, ends: Float64, path: Path, crs: str | None) -> None:

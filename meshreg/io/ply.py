@@ -20,11 +20,12 @@ from meshreg.io.assemble import (
     eight_bit_colors,
     without_broken_uv,
 )
+from meshreg.io.classes import RECLASS, ground_classes
 from meshreg.io.images import open_texture
 from meshreg.io.options import ReadOptions
 from meshreg.io.ply_body import Table, read_tables, scalar_columns
 from meshreg.io.ply_header import Header, read_header
-from meshreg.io.ply_write import rewrite, write
+from meshreg.io.ply_write import direction_notes, rewrite, write
 from meshreg.io.polygons import Triangles, triangulate
 from meshreg.io.safe import MissingReferenceError, decode_name, file_bytes, resolve_reference
 from meshreg.types import Float32, Int32, Survey, Texture
@@ -38,6 +39,7 @@ _COLORS = (
     ("r", "g", "b"),
 )
 _UV = (("s", "t"), ("u", "v"), ("texture_u", "texture_v"), ("texture_s", "texture_t"))
+_CLASS = ("classification", "Classification", "scalar_classification", "scalar_Classification")
 _WITHOUT = "Export it again, or leave the textures out (geometry_only, --geometry-only)."
 
 
@@ -80,12 +82,13 @@ def read(path: Path, options: ReadOptions) -> Survey:
             remedy="Cut it into blocks.",
         )
     tables = read_tables(header, file_bytes(path), path, ("vertex", "face"))
-    notes: list[str] = []
+    notes = list(direction_notes(header))
     points = scalar_columns(tables["vertex"], _XYZ, np.float64)
     colors = _colors(tables["vertex"], notes)
     counts = {"vertices": len(points)}
     face = tables.get("face")
     if face is None or not face.element.count:
+        points, colors = _ground(tables["vertex"], points, colors, notes, path)
         raw = RawGeometry(points, None, colors)
         return assemble_survey(path, raw, Found("ply", tuple(notes), (), counts), options)
     counts["faces"] = face.element.count
@@ -108,6 +111,25 @@ def read(path: Path, options: ReadOptions) -> Survey:
     raw = RawGeometry(points, faces, colors, uv, face_texture, textures)
     found = Found("ply", tuple(notes), companions, counts)
     return assemble_survey(path, raw, found, options)
+
+
+def _ground(
+    vertex: Table,
+    points: NDArray[np.float64],
+    colors: NDArray[np.uint8] | None,
+    notes: list[str],
+    path: Path,
+) -> tuple[NDArray[np.float64], NDArray[np.uint8] | None]:
+    """Leave out a cloud's points that are classed as noise or water."""
+    name = next((n for n in _CLASS if vertex.element.column(n) is not None), None)
+    if name is None:
+        return points, colors
+    keep = ground_classes(scalar_columns(vertex, (name,))[:, 0], notes)
+    if keep is None:
+        return points, colors
+    if not keep.any():
+        raise InputError(f"holds no usable point ({' '.join(notes)}).", file=path, remedy=RECLASS)
+    return points[keep], None if colors is None else colors[keep]
 
 
 def _colors(vertex: Table, notes: list[str]) -> NDArray[np.uint8] | None:

@@ -91,6 +91,26 @@ class Table:
             values = fitting(values, item, self.element.name, self.file)
         return (counts if item.count_kind else None), values
 
+    def locate(self, numbers: list[int]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Find the values of some scalar columns, ascending, in the bytes of `data`.
+
+        Returns
+        -------
+        starts : (rows + 1,) int64
+        places : (rows, K) int64
+        """
+        from meshreg.io.ply_kernels import locate
+
+        rows = self.element.count
+        starts = np.empty(rows + 1, np.int64)
+        places = np.empty((rows, len(numbers)), np.int64)
+        layout = _layout(self.element, self.is_text)
+        span = (self.start, self.end, rows)
+        wanted = np.array(numbers, np.int64)
+        big = self.order == ">"
+        locate(self.data, self.tokens, span, layout, big, wanted, starts, places)
+        return starts, places
+
     def _gather(self, number: int) -> tuple[NDArray[np.int64], NDArray[Any]]:
         from meshreg.io.ply_kernels import gather
 

@@ -114,6 +114,80 @@ def gather(
 
 
 @jit(nogil=True)
+def locate(
+    data: Any, tokens: Any, span: Any, layout: Any, big: bool, wanted: Any, starts: Any, places: Any
+) -> None:
+    """Find where each row starts and where its values of some scalar properties stand.
+
+    `walk` must have passed over the same rows; arguments as there, and
+
+    Parameters
+    ----------
+    wanted : (K,) int64
+        Numbers of properties, ascending.
+    starts : (rows + 1,) int64
+        Filled with the first byte of each row; the last is where the rows end.
+    places : (rows, K) int64
+        Filled with the first bytes of the values.
+    """
+    here, _, rows = span
+    for row in range(rows):
+        starts[row] = here
+        k = 0
+        for p in range(len(layout)):
+            code, count_size, size = layout[p]
+            count = 1
+            if code:
+                count = _count_at(data, tokens, here, code, big)
+                here += count_size
+            if k < len(wanted) and p == wanted[k]:
+                places[row, k] = here
+                k += 1
+            here += count * size
+    starts[rows] = here
+
+
+@jit(nogil=True)
+def splice(
+    data: Any, starts: Any, places: Any, old_sizes: Any, values: Any, new_sizes: Any, out: Any
+) -> int:
+    """Copy rows with some values replaced by others of the same or another size.
+
+    Parameters
+    ----------
+    data : (N,) uint8
+    starts, places : arrays
+        As `locate` gives them, of the rows to copy.
+    old_sizes, new_sizes : (K,) int64
+        Bytes of each value before and after.
+    values : (rows, K, 8) uint8
+        The new ones, in their first bytes.
+    out : (capacity,) uint8
+        Large enough.
+
+    Returns
+    -------
+    int
+        Bytes written.
+    """
+    at = 0
+    for row in range(len(starts) - 1):
+        here = starts[row]
+        for k in range(places.shape[1]):
+            for byte in data[here : places[row, k]]:
+                out[at] = byte
+                at += 1
+            for j in range(new_sizes[k]):
+                out[at] = values[row, k, j]
+                at += 1
+            here = places[row, k] + old_sizes[k]
+        for byte in data[here : starts[row + 1]]:
+            out[at] = byte
+            at += 1
+    return at
+
+
+@jit(nogil=True)
 def _is_blank(byte: int) -> bool:
     return byte in (32, 9)
 

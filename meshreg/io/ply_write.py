@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from meshreg.errors import InputError, OutputError, UsageError
+from meshreg.io.directions import Directions, bend_note, find_directions, stored, turn_columns
 from meshreg.io.images import texture_suffix, write_texture
 from meshreg.io.mover import Mover
 from meshreg.io.ply_body import Table, read_tables, scalar_columns
@@ -29,12 +30,11 @@ from meshreg.io.rewriting import (
 )
 from meshreg.io.safe import atomic_file, file_bytes, resolve_reference
 from meshreg.io.sidecar import write_shift
-from meshreg.types import Float64, Frame, Mesh, PointCloud, SourceFile, Survey
+from meshreg.types import Frame, Mesh, PointCloud, SourceFile, Survey
 
 _CHUNK = 1 << 18  # rows
 _BLOCK = 1 << 24  # bytes
 _XYZ = ("x", "y", "z")
-_NORMAL = ("nx", "ny", "nz")
 _TEXTURE = re.compile(rb"(\s*comment\s+(?i:texturefile)\s+)(.*?)(\s*)", re.DOTALL)
 
 
@@ -129,10 +129,11 @@ def _new_rows(geometry: Mesh | PointCloud, origin: Any) -> Iterator[NDArray[Any]
 
 
 def rewrite(source: SourceFile, move: Mover, path: Path) -> tuple[Path, ...]:
-    """Write a moved copy of a PLY file: x, y, z and normals change, nothing else.
+    """Write a moved copy of a PLY file: x, y, z and directions change, nothing else.
 
-    Format, order of elements, types, further properties and comments stay. Coordinates stored as
-    float or integer become double where they would step by more than 0.1 mm in the new frame.
+    Format, order of elements, types, further properties (lists too) and comments stay.
+    Coordinates stored as float or integer become double where they would step by more than 0.1 mm
+    in the new frame. Directions of faces turn too.
 
     Parameters
     ----------
@@ -148,51 +149,76 @@ def rewrite(source: SourceFile, move: Mover, path: Path) -> tuple[Path, ...]:
     Raises
     ------
     InputError
-        The source is not what it was when read, or its vertices have lists of varying length.
+        The source is not what it was when read.
     OutputError
         It cannot be written, or does not read back as written.
     """
     require_unchanged(source, path)
     header = read_header(source.path)
     data = file_bytes(source.path)
-    table = read_tables(header, data, source.path, ("vertex",))["vertex"]
-    if table.row is None:
-        raise _lists(source)
-    points = scalar_columns(table, _XYZ, np.float64)
-    new = _with_enough_digits(table.element, move, points, path)
+    turning = {item.name: element_directions(item) for item in header.elements}
+    changed = [
+        name for name in turning if name == "vertex" or (name == "face" and turning[name].columns)
+    ]
+    tables = read_tables(header, data, source.path, tuple(changed))
+    points = scalar_columns(tables["vertex"], _XYZ, np.float64)
+    new = _with_enough_digits(tables["vertex"].element, move, points, path)
+    parts = [_Part(table, table.element, None, turning[name]) for name, table in tables.items()]
+    at = list(tables).index("vertex")
+    parts[at] = replace(parts[at], new=new, points=points)
+    for part in parts:
+        if note := bend_note(part.found, move):
+            warn(path, note)
     renamed = _renamed_pages(source, header)
     extent = Extent()
     with atomic_file(path) as temporary:
         with open(temporary, "wb") as stream:
-            stream.writelines(_moved_header(header, table.element, new, renamed))
-            _copy(data, header.size, table.where[0], stream)
-            moved = _moved_rows(table, move, points)
-            if header.order:
-                _write_binary(table, new, moved, extent, stream)
-            else:
-                _write_text(table, bytes(data[slice(*table.where)]), moved, extent, stream)
-            _copy(data, table.where[1], len(data), stream)
+            stream.writelines(_moved_header(header, tables["vertex"].element, new, renamed))
+            here = header.size
+            for part in parts:
+                start, end = part.table.where
+                _copy(data, here, start, stream)
+                moved = _moved_columns(part, move, extent)
+                if not header.order:
+                    _write_text(part.table, bytes(data[start:end]), moved, stream)
+                elif part.table.row is not None:
+                    _write_binary(part.table, part.new, moved, stream)
+                else:
+                    _write_spliced(part.table, part.new, moved, stream)
+                here = end
+            _copy(data, here, len(data), stream)
         _check(temporary, replace(header, textures=renamed), extent, path)
     return (path, *copy_companions(source, path))
 
 
-def require_writable(source: SourceFile, move: Mover, sample: Float64) -> None:
-    """Refuse a file whose vertices have lists of varying length, before the work."""
-    del move, sample
-    header = read_header(source.path)
-    vertex = next(element for element in header.elements if element.name == "vertex")
-    if vertex.has_lists:
-        data = file_bytes(source.path)
-        if read_tables(header, data, source.path, ("vertex",))["vertex"].row is None:
-            raise _lists(source)
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """An element whose rows change: as it is, as it will be, its points if it has any."""
+
+    table: Table
+    new: Element
+    points: NDArray[np.float64] | None
+    found: Directions
 
 
-def _lists(source: SourceFile) -> InputError:
-    return InputError(
-        "has vertices with lists of varying length, which cannot be rewritten.",
-        file=source.path,
-        remedy="Export it without them.",
-    )
+def element_directions(element: Element) -> Directions:
+    """Find the attributes with a direction among an element's properties."""
+    scalars = [item for item in element.properties if not item.count_kind]
+    fixed = {item.name for item in scalars if item.kind[0] == "u"}
+    return find_directions((item.name for item in scalars), _XYZ, fixed)
+
+
+def direction_notes(header: Header) -> tuple[str, ...]:
+    """Return what a reader says of directions that a moved copy cannot turn."""
+    notes: tuple[str, ...] = ()
+    for element in header.elements:
+        found = element_directions(element)
+        placed = all(element.column(name) is not None for name in _XYZ)
+        if element.name in ("vertex", "face"):
+            notes += found.notes
+        elif element.count and (placed or found.columns or found.kept):
+            notes += (f"Element {element.name!r} holds places or directions; it is not moved.",)
+    return notes
 
 
 def _with_enough_digits(
@@ -243,26 +269,44 @@ def _moved_header(
     return lines
 
 
+def _numbers(element: Element, names: Iterable[str]) -> list[int]:
+    """Return the numbers of some columns, ascending."""
+    wanted = set(names)
+    return [number for number, item in enumerate(element.properties) if item.name in wanted]
+
+
 def _copy(data: NDArray[np.uint8], start: int, end: int, stream: BinaryIO) -> None:
     for here in range(start, end, _BLOCK):
         stream.write(data[here : min(here + _BLOCK, end)].data)
 
 
-def _moved_rows(
-    table: Table, move: Mover, points: NDArray[np.float64]
-) -> Iterator[tuple[slice, NDArray[np.float64], NDArray[np.float64] | None]]:
-    """Give chunks of rows: where, their moved points, their turned normals (or None)."""
-    items = {item.name: item for item in table.element.properties}
-    normals = None
-    if all(name in items and items[name].kind[0] == "f" for name in _NORMAL):
-        normals = scalar_columns(table, _NORMAL, np.float64)
-    for start in range(0, len(points), _CHUNK):
-        part = slice(start, min(start + _CHUNK, len(points)))
-        turned = None if normals is None else move.directions(points[part], normals[part])
-        yield part, moved_points(move, points[part]), turned
+def _moved_columns(
+    change: _Part, move: Mover, extent: Extent
+) -> Iterator[tuple[slice, dict[str, NDArray[Any]]]]:
+    """Give chunks of rows: where, and the columns that change, in the type to be written."""
+    table, new, points, found = change.table, change.new, change.points, change.found
+    old = {}
+    for name in found.columns:
+        number = table.element.column(name)
+        assert number is not None
+        old[name] = table.column(number)[1]
+    kinds = {item.name: np.dtype(item.kind) for item in new.properties}
+    if table.is_text:  # as many digits as there are
+        kinds = {k: np.dtype(np.float64) if v.kind == "f" else v for k, v in kinds.items()}
+    for start in range(0, table.element.count, _CHUNK):
+        part = slice(start, min(start + _CHUNK, table.element.count))
+        here = np.zeros((part.stop - start, 3)) if points is None else points[part]
+        columns = turn_columns(found, move, here, {name: old[name][part] for name in old})
+        if points is not None:
+            columns |= dict(zip(_XYZ, moved_points(move, here).T, strict=True))
+        written = {name: stored(values, kinds[name]) for name, values in columns.items()}
+        if points is not None:
+            extent.add(np.stack([written[name] for name in _XYZ], axis=1))
+        yield part, written
 
 
-def _write_binary(table: Table, new: Element, moved: Any, extent: Extent, stream: BinaryIO) -> None:
+def _write_binary(table: Table, new: Element, moved: Any, stream: BinaryIO) -> None:
+    """Write rows that are all alike."""
     assert table.row is not None
     assert table.row.names is not None
     view = np.ndarray((new.count,), table.row, table.data.data, table.start)
@@ -272,42 +316,59 @@ def _write_binary(table: Table, new: Element, moved: Any, extent: Extent, stream
         kind = table.row[name]
         widened = name[0] == "v" and item.kind == "f8" and item.name in _XYZ
         fields.append((name, np.dtype(table.order + "f8") if widened else kind))
-    for part, points, normals in moved:
-        rows = np.empty(len(points), fields)
+    for part, columns in moved:
+        rows = np.empty(part.stop - part.start, fields)
         for name in table.row.names:
             rows[name] = view[name][part]
-        for names, values in ((_XYZ, points), (_NORMAL, normals)):
-            if values is not None:
-                for axis, name in enumerate(names):
-                    rows[f"v{new.column(name)}"] = values[:, axis]
-        extent.add(np.stack([rows[f"v{new.column(name)}"] for name in _XYZ], axis=1))
+        for name, values in columns.items():
+            rows[f"v{new.column(name)}"] = values
         stream.write(rows.data)
 
 
-def _write_text(table: Table, text: bytes, moved: Any, extent: Extent, stream: BinaryIO) -> None:
+def _write_spliced(table: Table, new: Element, moved: Any, stream: BinaryIO) -> None:
+    """Write rows whose lists differ in length: their bytes, but for those of some columns."""
+    from meshreg.io.ply_kernels import splice
+
+    starts = places = np.empty(0, np.int64)
+    numbers: list[int] = []
+    for part, columns in moved:
+        if not numbers:
+            numbers = _numbers(new, columns)
+            starts, places = table.locate(numbers)
+        items = [new.properties[number] for number in numbers]
+        sizes = np.array([int(item.kind[1]) for item in items])
+        before = np.array([int(table.element.properties[number].kind[1]) for number in numbers])
+        values = np.zeros((part.stop - part.start, len(numbers), 8), np.uint8)
+        for k, item in enumerate(items):
+            ordered = columns[item.name].astype(table.order + item.kind)
+            values[:, k, : sizes[k]] = ordered.view(np.uint8).reshape(-1, sizes[k])
+        rows = starts[part.start : part.stop + 1]
+        room = int(rows[-1] - rows[0] + len(values) * (sizes - before).clip(0).sum())
+        out = np.empty(room, np.uint8)
+        size = splice(table.data, rows, places[part], before, values, sizes, out)
+        stream.write(out[:size].data)
+
+
+def _write_text(table: Table, text: bytes, moved: Any, stream: BinaryIO) -> None:
     """Replace words in the lines of text; the other words and the line ends stay."""
-    assert table.row is not None
-    place = {}
-    for number, item in enumerate(table.element.properties):
-        place[item.name] = table.row.fields[f"v{number}"][1] // 8  # type: ignore[index]
     lines = (line for line in re.findall(rb"[^\r\n]*(?:\r\n|\n|\r)|[^\r\n]+", text))
-    for part, points, normals in moved:
-        done = 0
-        columns = [(place[name], points[:, k]) for k, name in enumerate(_XYZ)]
-        if normals is not None:
-            columns += [(place[name], normals[:, k]) for k, name in enumerate(_NORMAL)]
+    for part, columns in moved:
+        numbers = _numbers(table.element, columns)
+        starts, places = table.locate(numbers)
+        words = (places - starts[:-1, None]) // 8  # numbers of words in their rows
+        names = [table.element.properties[number].name for number in numbers]
         # 15 digits: what was written with up to 15 comes out the same when nothing moves.
-        words = [(at, [f"{value:.15g}".encode() for value in values]) for at, values in columns]
+        texts = [[f"{value:.15g}".encode() for value in columns[name].tolist()] for name in names]
+        done = 0
         while done < part.stop - part.start:
             line = next(lines)
             row = line.split()
             if row:
-                for at, column in words:
-                    row[at] = column[done]
+                for k, at in enumerate(words[part.start + done].tolist()):
+                    row[at] = texts[k][done]
                 done += 1
                 line = b" ".join(row) + line[len(line.rstrip(b"\r\n")) :]
             stream.write(line)
-        extent.add(points)
     stream.writelines(lines)
 
 

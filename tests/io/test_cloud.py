@@ -12,6 +12,7 @@ import pyproj
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from meshreg.errors import InputError, MeshregError, OutputError
 from meshreg.io import read_survey, rewrite_survey, write_survey
@@ -639,3 +640,43 @@ def test_points_without_coordinates_stay_so(tmp_path):
     assert "1 points without coordinates" in again.notes[0]
     assert len(again.geometry.points) == 499
     assert laspy.read(path).header.scales == pytest.approx([1e-4] * 3)
+
+
+@pytest.mark.parametrize("suffix", [".las", ".laz"])
+def test_directions_in_any_kind_of_extra_dimension_turn(tmp_path, suffix):
+    rng = np.random.default_rng(12)
+    normals = rng.normal(size=(500, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    made(tmp_path / "a.las")
+    data = laspy.read(tmp_path / "a.las")
+    extra = laspy.ExtraBytesParams
+    steps = {"scales": np.array([1e-4]), "offsets": np.array([0.0])}
+    data.add_extra_dims(
+        [
+            *(extra(f"normal {axis}", "i2", **steps) for axis in "xyz"),
+            extra("Normals", "3f4"),
+            extra("Dip direction", "f4"),
+            *(extra(f"n{axis}", "u1") for axis in "xyz"),
+        ]
+    )
+    for k, axis in enumerate("xyz"):
+        data[f"normal {axis}"] = normals[:, k]
+        data[f"n{axis}"] = np.full(500, 7)
+    data["Normals"] = normals
+    data["Dip direction"] = np.full(500, 90)
+    path = tmp_path / f"b{suffix}"
+    data.write(path)
+    survey = read_survey(path)
+    assert survey.notes == (
+        "Attributes that depend on the survey's orientation are not turned with it: "
+        "'Dip direction', 'nx', 'ny', 'nz'.",
+    )
+    turn = Rotation.from_rotvec([0.2, -0.1, 0.9]).as_matrix()
+    files = rewrite_survey(survey, Transform(turn, pivot=survey.centre), tmp_path / "out")
+    after = laspy.read(files[0])
+    expected = normals @ turn.T
+    assert np.asarray(after["Normals"]) == pytest.approx(expected, abs=2e-7)
+    turned = np.stack([np.asarray(after[f"normal {axis}"]) for axis in "xyz"], axis=1)
+    assert turned == pytest.approx(expected, abs=1.5e-4)  # two roundings to 1e-4
+    assert (np.asarray(after["Dip direction"]) == 90).all()
+    assert (np.asarray(after["nx"]) == 7).all()

@@ -11,6 +11,7 @@ import reference_ply as twin
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from meshreg.errors import InputError, UnsafeReferenceError, UsageError
 from meshreg.io.frames import make_mover
@@ -693,7 +694,7 @@ def test_rewrite_copies_the_pages_and_keeps_lost_vertices(tmp_path):
     assert len(rows) == len(points)
 
 
-def test_rewrite_refuses_itself_a_changed_source_and_ragged_vertices(tmp_path):
+def test_rewrite_refuses_itself_and_a_changed_source(tmp_path):
     source = ply(tmp_path / "a.ply", mesh_elements())
     survey = read(source, ReadOptions())
     with pytest.raises(UsageError, match="itself"):
@@ -701,13 +702,126 @@ def test_rewrite_refuses_itself_a_changed_source_and_ragged_vertices(tmp_path):
     source.write_bytes(source.read_bytes() + b"\n")
     with pytest.raises(InputError, match="changed"):
         rewrite(survey.source[0], mover(survey), tmp_path / "b.ply")
-    ragged = [*XYZ, ("tags", ("uchar", "int"))]
-    rows = [[*point, [1] * k] for k, point in enumerate(SQUARE)]
-    survey = read(ply(tmp_path / "c.ply", [("vertex", ragged, rows)]), ReadOptions())
-    with pytest.raises(InputError, match="varying length"):
-        rewrite(survey.source[0], mover(survey), tmp_path / "b.ply")
     assert not (tmp_path / "b.ply").exists()
-    assert sorted(item.name for item in tmp_path.iterdir()) == ["a.ply", "c.ply"]
+    assert sorted(item.name for item in tmp_path.iterdir()) == ["a.ply"]
+
+
+@given(files(), ORDERS, st.booleans())
+@settings(max_examples=40, deadline=None)
+def test_rewrite_keeps_lists_of_any_length(tmp_path_factory, elements, order, far):
+    """Vertices whose lists differ in length keep them; wider coordinates make room."""
+    path = tmp_path_factory.mktemp("ply") / "a.ply"
+    vertex, face = elements[1], elements[3]
+    face[1].extend([("nx", "float"), ("ny", "float"), ("nz", "double")])
+    for row in face[2]:
+        row += [0.6, -0.8, 0.0]
+    source = ply(path, elements, order=order)
+    try:
+        survey = read(source, ReadOptions())
+    except InputError as error:
+        assert "no usable face" in error.message  # noqa: PT017
+        return
+    offset = (500000.25, 6000000.5, 0.0) if far else (10, -20, 3)
+    move = Transform(TURN.rotation, 1.25, offset)
+    (written,) = rewrite(survey.source[0], mover(survey, move), path.with_name("b.ply"))
+    old, new = twin.decode(source.read_bytes()), twin.decode(written.read_bytes())
+    assert old.keys() == new.keys()
+    for name in ("camera", "edge", "tail"):
+        assert new[name] == old[name]
+    names = [name for name, _ in vertex[1]]
+    columns = [names.index(axis) for axis in "xyz"]
+    for before, after in zip(old["vertex"][1], new["vertex"][1], strict=True):
+        kept = [k for k in range(len(names)) if k not in columns]
+        assert [after[k] for k in kept] == [before[k] for k in kept]
+        expected = move.apply([[before[k] for k in columns]])[0]
+        step = 1e-4 if far else 1e-6 * (1 + np.abs(expected).max())
+        assert [after[k] for k in columns] == pytest.approx(expected, abs=step)
+    for before, after in zip(old["face"][1], new["face"][1], strict=True):
+        assert after[:-3] == before[:-3]
+        assert after[-3:] == pytest.approx([0.96, -0.28, 0.0], abs=1e-6)
+
+
+@pytest.mark.parametrize("order", ["", "<", ">"])
+def test_rewrite_turns_splats(tmp_path, order):
+    """Orientation, size and color of 3D Gaussian splats; their harmonics are in test_directions."""
+    rng = np.random.default_rng(4)
+    names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
+    names += [f"f_rest_{k}" for k in range(45)] + ["opacity", "scale_0", "scale_1", "scale_2"]
+    names += [f"rot_{k}" for k in range(4)]
+    rows = rng.normal(size=(30, len(names))).astype("f4").astype(float)
+    elements = [("vertex", [(name, "float") for name in names], rows.tolist())]
+    survey = read(ply(tmp_path / "a.ply", elements, order=order), ReadOptions())
+    assert not any("not turned" in note for note in survey.notes)
+    files = rewrite(survey.source[0], mover(survey), tmp_path / "b.ply")
+    new = np.array(twin.decode(files[0].read_bytes())["vertex"][1])
+
+    def column(table, *wanted):
+        return np.stack([table[:, names.index(name)] for name in wanted], axis=1)
+
+    same = ("f_dc_0", "f_dc_1", "f_dc_2", "opacity")
+    assert (column(new, *same) == column(rows, *same)).all()
+    size = ("scale_0", "scale_1", "scale_2")
+    np.testing.assert_allclose(column(new, *size), column(rows, *size) + np.log(1.25), atol=1e-6)
+    normal = ("nx", "ny", "nz")
+    np.testing.assert_allclose(
+        column(new, *normal), column(rows, *normal) @ TURN.rotation.T, atol=1e-6
+    )
+    turn = tuple(f"rot_{k}" for k in range(4))
+    before, after = (
+        Rotation.from_quat(column(table, *turn), scalar_first=True) for table in (rows, new)
+    )
+    np.testing.assert_allclose(after.as_matrix(), TURN.rotation @ before.as_matrix(), atol=1e-5)
+    # Degree 1 is a vector: (y, z, x) up to signs, the same for all colors.
+    for channel in range(3):
+        first = [f"f_rest_{15 * channel + k}" for k in (2, 0, 1)]
+        signs = np.array([-1, -1, 1])
+        np.testing.assert_allclose(
+            signs * column(new, *first), (signs * column(rows, *first)) @ TURN.rotation.T, atol=1e-6
+        )
+
+
+def test_what_a_copy_cannot_turn_is_named(tmp_path):
+    properties = [
+        *XYZ,
+        ("Dip_direction", "float"),
+        ("nx", "uchar"),
+        ("ny", "uchar"),
+        ("nz", "uchar"),
+    ]
+    rows = [[*point, 90.0, 1, 2, 3] for point in SQUARE]
+    elements = [
+        ("vertex", properties, rows),
+        ("camera", [("view_px", "float"), ("x_axisx", "float"), ("x_axisy", "float"),
+                    ("x_axisz", "float")], [[1.0, 1.0, 0.0, 0.0]]),
+    ]  # fmt: skip
+    survey = read(ply(tmp_path / "a.ply", elements), ReadOptions())
+    assert "not turned with it: 'Dip_direction', 'nx', 'ny', 'nz'." in survey.notes[0]
+    assert survey.notes[1] == "Element 'camera' holds places or directions; it is not moved."
+    files = rewrite(survey.source[0], mover(survey), tmp_path / "b.ply")
+    old, new = (twin.decode(path.read_bytes()) for path in (tmp_path / "a.ply", files[0]))
+    assert new["camera"] == old["camera"]
+    assert [row[3:] for row in new["vertex"][1]] == [row[3:] for row in old["vertex"][1]]
+
+
+def test_signed_integers_hold_a_normal(tmp_path):
+    properties = [*XYZ, *((name, "char") for name in ("nx", "ny", "nz"))]
+    rows = [[*point, 127, 0, 0] for point in SQUARE]
+    survey = read(ply(tmp_path / "a.ply", [("vertex", properties, rows)]), ReadOptions())
+    files = rewrite(survey.source[0], mover(survey), tmp_path / "b.ply")
+    new = twin.decode(files[0].read_bytes())["vertex"][1]
+    assert [row[3:] for row in new] == [[102, 76, 0]] * 4  # 127 times 0.8 and 0.6
+
+
+def test_classes_of_noise_and_water_are_left_out_of_a_cloud(tmp_path):
+    properties = [*XYZ, ("red", "uchar"), ("green", "uchar"), ("blue", "uchar")]
+    properties += [("classification", "uchar")]
+    classes = [1, 41, 40, 7, 9, 45]
+    rows = [[k, k * k, -k, k, k, k, c] for k, c in enumerate(classes)]
+    survey = read(ply(tmp_path / "a.ply", [("vertex", properties, rows)]), ReadOptions())
+    assert absolute(survey)[:, 0].tolist() == [0, 2]
+    assert survey.geometry.colors.tolist() == [[0] * 3, [2] * 3]
+    assert survey.notes[0].startswith("1 points classed as noise")
+    assert survey.notes[1].startswith("3 points classed as water")
 
 
 @given(st.integers(0, 2**32 - 1), st.booleans(), st.integers(0, 3))
