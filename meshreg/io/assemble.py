@@ -16,6 +16,7 @@ from meshreg.io.frames import Placed, place
 from meshreg.io.options import ReadOptions
 from meshreg.io.polygons import usable_faces
 from meshreg.io.safe import FARTHEST, fingerprint, sha256
+from meshreg.io.sidecar import SidecarInfo
 from meshreg.types import Bool, Int32, Mesh, PointCloud, SourceFile, Survey, Texture, UInt8
 
 _LOG = logging.getLogger("meshreg")
@@ -70,6 +71,8 @@ class Found:
         Of the format, where neither user nor sidecar says otherwise.
     crs : str or None
         Found in the file.
+    own : SidecarInfo or None
+        What the file says of its shift.
     sha256 : str or None
         Of the file, where the reader had all its bytes in hand anyway.
     """
@@ -80,6 +83,7 @@ class Found:
     counts: Mapping[str, int] = field(default_factory=dict)
     axes: NDArray[np.float64] = field(default_factory=lambda: _AXES)
     crs: str | None = None
+    own: SidecarInfo | None = None
     sha256: str | None = None
 
 
@@ -104,7 +108,15 @@ def assemble_survey(path: Path, raw: RawGeometry, found: Found, options: ReadOpt
     notes = (*found.notes, *notes)
     for note in notes:
         _LOG.warning("%s: %s", path.name, note)
-    placed = place(path, raw.points, options, found.crs, found.axes, detail=lambda: texel_size(raw))
+    placed = place(
+        path,
+        raw.points,
+        options,
+        found.crs,
+        found.axes,
+        own=found.own,
+        detail=lambda: texel_size(raw),
+    )
     geometry: Mesh | PointCloud
     if raw.faces is None:
         geometry = PointCloud(placed.points, raw.colors)

@@ -188,7 +188,7 @@ def _drop_notes(counts: dict[str, int]) -> list[str]:
 
 
 def _sidecar_says_unit(path: Path) -> bool:
-    sidecar = find_sidecar(path, shared=False)
+    sidecar = find_sidecar(path, shared=False, again=True)
     return sidecar is not None and sidecar.unit is not None
 
 

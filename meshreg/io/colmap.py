@@ -77,7 +77,7 @@ def read(path: Path, options: ReadOptions) -> Survey:
     _require_consistent(options)
     files = find_model(path)
     model, _ = read_model(files)
-    sidecar = find_sidecar(path, shared=False)
+    sidecar = find_sidecar(path, shared=False, given=options)
     notes: list[str] = []
     kept = _kept(model, notes)
     try:

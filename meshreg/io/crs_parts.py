@@ -83,6 +83,19 @@ def parse_crs(value: str) -> Any:
         ) from error
 
 
+@lru_cache(maxsize=64)
+def local_axes(latitude: float, longitude: float) -> str:
+    """Return a CRS of axes east and north in the plane that touches WGS 84 at a place [degrees].
+
+    The orthographic projection (EPSG method 9840): easting and northing of points on the ellipsoid
+    are those of the topocentric system there (EPSG method 9837).
+    """
+    place = f"+lat_0={latitude!r} +lon_0={longitude!r}"
+    crs = parse_crs(f"+proj=ortho {place} +datum=WGS84 +units=m +no_defs +type=crs")
+    named = crs.to_json_dict() | {"name": f"local axes at {latitude:.7g}, {longitude:.7g}"}
+    return str(type(crs).from_json_dict(named).to_wkt())
+
+
 def short(text: Any, length: int = 80) -> str:
     """Return a text on one line, cut to a length, for messages."""
     text = " ".join(str(text).split())

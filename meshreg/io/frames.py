@@ -33,6 +33,7 @@ from meshreg.io.options import ReadOptions
 from meshreg.io.precision import single_precision_note
 from meshreg.io.safe import FARTHEST
 from meshreg.io.sidecar import SidecarInfo, find_sidecar
+from meshreg.io.unapplied import unapplied_notes
 from meshreg.types import Float64, Frame, Maps, Mesh, PointCloud, SourceFile, Survey
 
 _LOG = logging.getLogger("meshreg")
@@ -63,6 +64,7 @@ def place(
     default_axes: Any = None,
     *,
     georeferenced: bool = False,
+    own: SidecarInfo | None = None,
     detail: Callable[[], float | None] | None = None,
 ) -> Placed:
     """Do what every reader does with its points: find the sidecar, the frame and a local origin.
@@ -78,6 +80,8 @@ def place(
     georeferenced : bool
         The format states absolute coordinates itself (LAS, GeoTIFF): a shift file that speaks for
         a whole folder (offset.xyz, coords.txt, SHIFT.txt) is not meant for it.
+    own : SidecarInfo, optional
+        What the file says itself of its shift.
     detail : callable, optional
         Returns the size of a pixel on the ground, in units of `xyz`; asked only where coordinates
         went through 32-bit numbers.
@@ -94,7 +98,7 @@ def place(
     if not np.isfinite(ends).all():
         raise InputError(f"has coordinates {ends.tolist()} that are not finite.", file=path)
     notes = single_precision_note(path, xyz, ends, detail)
-    sidecar = find_sidecar(path, shared=not georeferenced)
+    sidecar = find_sidecar(path, shared=not georeferenced, own=own, given=options)
     # The median, because a single stray point must not decide where the survey is.
     centre = np.median(xyz[:: max(1, len(xyz) // 10_000)].astype(np.float64), axis=0)
     try:
@@ -104,6 +108,8 @@ def place(
         origin = np.round(to_absolute(frame, centre[None])[0])
         points = _from_origin(frame, xyz, origin)
         notes += _frame_notes(options, sidecar, frame, centre)
+        if not georeferenced and not frame.shift.any():
+            notes += unapplied_notes(path, frame, centre)
     except MeshregError as error:
         error.file = error.file or str(path)
         raise
@@ -263,7 +269,8 @@ def _grid_note(survey: Survey) -> str:
 def registered_frame(reference: SourceFile, moving: SourceFile, *, centre: Any = None) -> Frame:
     """Return the frame that the registered moving file is written in: the reference file's.
 
-    glTF keeps its own axes (the format says Y up), in metres, with the reference's shift. Where
+    glTF keeps its own axes (the format says Y up), in metres, with the reference's shift; one that
+    is geocentric stays so, and no other file becomes so. Where
     that shift would leave glTF or STL, which know 32-bit numbers only, with coordinates that step
     by more than 0.1 mm, they get a round shift of their own at `centre`.
 
@@ -276,10 +283,17 @@ def registered_frame(reference: SourceFile, moving: SourceFile, *, centre: Any =
     """
     frame = reference.frame
     own_axes = moving.format in ("glb", "gltf")
+    if own_axes and moving.frame.crs == frame.crs and _geocentric(moving.frame):
+        return moving.frame
+    if _geocentric(frame) and not _geocentric(moving.frame):
+        place = np.zeros(3) if centre is None else np.round(np.asarray(centre, float))
+        frame = Frame(ENU, place, frame.crs, frame.crs)
     if own_axes:
         unit = float(np.cbrt(abs(np.linalg.det(moving.frame.axes))))
         shift = frame.shift if frame.is_linear else np.zeros(3)
-        frame = Frame(np.round(moving.frame.axes / unit, 12), shift, frame.crs, frame.crs)
+        # a geocentric file has no axis that points up: it becomes what its format wants
+        axes = Y_UP if _geocentric(moving.frame) else np.round(moving.frame.axes / unit, 12)
+        frame = Frame(axes, shift, frame.crs, frame.crs)
     if centre is None or not (own_axes or moving.format == "stl"):
         return frame
     local = to_file(frame, np.atleast_2d(centre))
@@ -287,6 +301,10 @@ def registered_frame(reference: SourceFile, moving: SourceFile, *, centre: Any =
         return frame
     axes = frame.axes if frame.is_linear else ENU
     return Frame(axes, np.round(np.asarray(centre, float)), frame.crs, frame.crs)
+
+
+def _geocentric(frame: Frame) -> bool:
+    return frame.file_crs is not None and bool(parse_crs(frame.file_crs).is_geocentric)
 
 
 __all__ = [

@@ -22,6 +22,7 @@ from meshreg.io.assemble import (
     without_broken_uv,
 )
 from meshreg.io.frames import ENU, Y_UP
+from meshreg.io.gltf_center import relative_to_center, unread_places
 from meshreg.io.gltf_document import Document, read_document
 from meshreg.io.gltf_parts import Notes, Part, read_parts
 from meshreg.io.gltf_rewrite import rewrite
@@ -72,16 +73,18 @@ def read(path: Path, options: ReadOptions) -> Survey:
         raw = RawGeometry(
             raw.points[kept], new[raw.faces], None, raw.uv, raw.face_texture, raw.textures
         )
-    axes = Y_UP
-    if _may_guess(document, options) and _plainly_z_up(raw):
-        axes = ENU
+    z_up = _may_guess(document, options) and _plainly_z_up(raw)
+    axes = ENU if z_up else Y_UP
+    said = relative_to_center(document, raw, axes, options, notes.texts)
+    if z_up and said.up_counts:
         notes.texts.append(
             "The file is thin along its z axis and faces it: it was read as z up, against glTF's "
             "y up. Say --up y if that is wrong."
         )
     kind = "glb" if document.is_binary else "gltf"
     companions = _companions(document, options, notes)
-    found = Found(kind, tuple(notes.all()), companions, counts, axes)
+    notes.texts += unread_places(document)
+    found = Found(kind, tuple(notes.all()), companions, counts, said.axes, said.crs, said.own)
     return assemble_survey(path, raw, found, options)
 
 
@@ -122,7 +125,7 @@ def _may_guess(document: Document, options: ReadOptions) -> bool:
         return False
     if document.tree["asset"].get("generator") == "meshreg":
         return False
-    said = find_sidecar(document.path)
+    said = find_sidecar(document.path, again=True)
     return said is None or (said.up is None and said.axes is None)
 
 

@@ -33,6 +33,7 @@ _UNDERSTOOD = (
     "KHR_texture_transform",
     "KHR_mesh_quantization",
     "EXT_texture_webp",
+    "CESIUM_RTC",
 )
 _COMPRESSED = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression")
 

@@ -13,6 +13,7 @@ from urllib.parse import quote
 import numpy as np
 
 from meshreg.errors import InputError
+from meshreg.io.gltf_center import center_of, with_center
 from meshreg.io.gltf_document import Document, read_document
 from meshreg.io.gltf_nodes import roots_of, scene_roots
 from meshreg.io.gltf_parts import read_geometry
@@ -63,6 +64,7 @@ def rewrite(source: SourceFile, move: Mover, path: Path) -> tuple[Path, ...]:
     expected = points @ move.matrix[:3, :3].T + move.matrix[:3, 3]
     tree = _with_matrix(document, move.matrix)
     _rename(document, source, tree)
+    _recenter(document, source, move, tree)
     text = json.dumps(tree, ensure_ascii=False, allow_nan=False, separators=(",", ":")).encode()
     copies = copy_companions(source, path)
     with atomic_file(path) as temporary:
@@ -109,6 +111,17 @@ def require_writable(source: SourceFile, move: Mover, sample: Float64) -> None:
             file=source.path,
             remedy="Convert it to .ply or .obj first.",
         )
+
+
+def _recenter(document: Document, source: SourceFile, move: Mover, tree: dict[str, Any]) -> None:
+    """Let CESIUM_RTC give the new file's shift, in the way in which it gave the old one's."""
+    center = center_of(document)
+    if center is None:
+        return
+    frame = source.frame
+    turned = not np.allclose(center, frame.shift) and np.allclose(frame.axes @ center, frame.shift)
+    shift = move.frame.shift
+    with_center(tree, np.linalg.solve(move.frame.axes, shift) if turned else shift)
 
 
 def _rename(document: Document, source: SourceFile, tree: dict[str, Any]) -> None:

@@ -104,7 +104,7 @@ def read_pair(dem: Path, ortho: Path | None, options: ReadOptions) -> Survey:
     if colors is not None and colors.crs is not None and not (heights.crs or options.crs):
         notes.append("The DEM states no CRS; the orthomosaic's was taken for it.")
         options = replace(options, crs=colors.crs)
-    sidecar = find_sidecar(dem, shared=False)
+    sidecar = find_sidecar(dem, shared=False, given=options)
     frame = map_frame(heights, options, sidecar)
     if any(frame.shift):
         text = ", ".join(f"{value:.12g}" for value in frame.shift)

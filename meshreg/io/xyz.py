@@ -55,7 +55,7 @@ def read(path: Path, options: ReadOptions) -> Survey:
     """
     path = Path(path)
     data = file_bytes(path)
-    sidecar = find_sidecar(path)
+    sidecar = find_sidecar(path, given=options)
     layout = read_layout(data, path, None if sidecar is None else sidecar.columns)
     notes = [*layout.notes, *layout.directions.notes]
     colored = set(_RGB) <= layout.where.keys() and not options.geometry_only

@@ -91,7 +91,7 @@ def rewrite(source: SourceFile, move: Mover, path: Path) -> tuple[Path, ...]:
 
     require_unchanged(source, path)
     data = file_bytes(source.path)
-    sidecar = find_sidecar(source.path)
+    sidecar = find_sidecar(source.path, again=True)
     said = None if sidecar is None else sidecar.columns
     layout = read_layout(data, source.path, said)
     found = layout.directions
