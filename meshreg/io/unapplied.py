@@ -67,6 +67,8 @@ def _comments(path: Path) -> list[str]:
     """Return the comments at the head of a text file or of a PLY, without their marks."""
     if path.suffix.lower() not in (".obj", ".off", ".ply", ".xyz", ".txt", ".csv", ".asc", ".pts"):
         return []
+    if not path.is_file():  # points from elsewhere, as under this name
+        return []
     with open_regular(path) as stream:
         head = stream.read(_HEAD)
     if head.startswith(b"ply"):
