@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from meshreg.errors import InputError, UsageError
-from meshreg.io.safe import file_bytes, open_regular, require_inside
+from meshreg.io.safe import decode_name, file_bytes, open_regular, require_inside
 from meshreg.types import Float64, UInt8
 
 PARTS = ("cameras", "images", "points3D")
@@ -193,15 +193,32 @@ def _plain(files: ModelFiles, model: Any, posed: list[Any]) -> Model:
             file=files.folder / f"images{files.suffix}",
             remedy=_AGAIN,
         )
+    names = _text_names(files.folder / "images.txt") if files.suffix == ".txt" else {}
     return Model(
         points=np.array([point.xyz for point in points], float).reshape(-1, 3),
         colors=np.array([point.color for point in points], np.uint8).reshape(-1, 3),
         errors=np.array([point.error for point in points], float),
         tracks=np.array([point.track.length() for point in points]),
-        names=tuple(map(_image_name, posed)),
+        names=tuple(names.get(image.image_id) or _image_name(image) for image in posed),
         centres=-np.einsum("nji,nj->ni", turns, shifts),  # C = -R' t
         views=turns[:, 2],  # the camera's z axis, seen from the world
     )
+
+
+def _text_names(path: Path) -> dict[int, str]:
+    """Return the images' names by their numbers: all that follows the ninth word of a line.
+
+    pycolmap (as of 4.2) cuts a name at its first blank.
+    """
+    names = {}
+    with open_regular(path) as stream:
+        lines = iter(stream)
+        for line in lines:
+            words = line.strip().split(None, 9)
+            if len(words) == 10 and not words[0].startswith(b"#"):
+                names[int(words[0])] = decode_name(words[9])
+                next(lines, b"")  # what it saw
+    return names
 
 
 def _image_name(image: Any) -> str:
@@ -219,6 +236,17 @@ def camera_from_world(image: Any) -> Any:
 
 def _check_binary(path: Path) -> None:
     """Walk through a file of the binary format; all counts must fit what is there."""
+    binary_places(path)
+
+
+def binary_places(path: Path) -> list[int]:
+    """Return the bytes at which the poses (7 doubles) or points (3 doubles) of a file stand.
+
+    Raises
+    ------
+    InputError
+        The counts in the file do not fit its size.
+    """
     data = file_bytes(path)
     walker = {
         "cameras": _walk_cameras,
@@ -227,14 +255,14 @@ def _check_binary(path: Path) -> None:
         "rigs": _walk_rigs,
         "frames": _walk_frames,
     }[path.stem]
-    place = 8
+    place, places = 8, []  # type: ignore[var-annotated]
     try:
         count = struct.unpack("<Q", data[:8].tobytes())[0]
         if count > data.size:
             raise InputError(
                 f"declares {count} items, but has {data.size} bytes.", file=path, remedy=_AGAIN
             )
-        place = walker(memoryview(data), count)  # type: ignore[arg-type]
+        place = walker(memoryview(data), count, places)  # type: ignore[arg-type]
     except (struct.error, _CutOffError) as error:
         raise InputError(
             f"ends early: it has {data.size} bytes.", file=path, remedy=_AGAIN
@@ -243,6 +271,7 @@ def _check_binary(path: Path) -> None:
         raise InputError(
             f"has {data.size} bytes; its {count} items take {place}.", file=path, remedy=_AGAIN
         )
+    return places
 
 
 class _CutOffError(Exception):
@@ -255,7 +284,8 @@ def _within(place: int, data: memoryview) -> int:
     return place
 
 
-def _walk_cameras(data: memoryview, count: int) -> int:
+def _walk_cameras(data: memoryview, count: int, places: list[int]) -> int:
+    del places
     place = 8
     for _ in range(count):
         kind = struct.unpack_from("<i", data, place + 4)[0]
@@ -265,9 +295,10 @@ def _walk_cameras(data: memoryview, count: int) -> int:
     return place
 
 
-def _walk_images(data: memoryview, count: int) -> int:
+def _walk_images(data: memoryview, count: int, places: list[int]) -> int:
     place = 8
     for _ in range(count):
+        places.append(place + 4)
         place = _within(place + 64, data)  # id, 7 doubles of the pose, camera
         for start in range(place, len(data), 256):
             end = bytes(data[start : start + 256]).find(b"\0")
@@ -280,29 +311,32 @@ def _walk_images(data: memoryview, count: int) -> int:
     return place
 
 
-def _walk_points(data: memoryview, count: int) -> int:
+def _walk_points(data: memoryview, count: int, places: list[int]) -> int:
     place, length = 8, struct.Struct("<Q")
     for _ in range(count):
+        places.append(place + 8)
         place = place + 51 + 8 * length.unpack_from(data, place + 43)[0]
         if place > len(data):
             raise _CutOffError
     return place
 
 
-def _walk_rigs(data: memoryview, count: int) -> int:
+def _walk_rigs(data: memoryview, count: int, places: list[int]) -> int:
     place = 8
     for _ in range(count):
         sensors = struct.unpack_from("<I", data, place + 4)[0]
         place = _within(place + 8 + (8 if sensors else 0), data)
         for _ in range(sensors - 1):
             posed = struct.unpack_from("<B", data, place + 8)[0]
+            places += [place + 9] * bool(posed)
             place = _within(place + 9 + (56 if posed else 0), data)
     return place
 
 
-def _walk_frames(data: memoryview, count: int) -> int:
+def _walk_frames(data: memoryview, count: int, places: list[int]) -> int:
     place = 8
     for _ in range(count):
+        places.append(place + 8)
         place = _within(place + 68 + 16 * struct.unpack_from("<I", data, place + 64)[0], data)
     return place
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import re
 import warnings
 from collections.abc import Sequence
@@ -80,7 +81,7 @@ def read_positions(path: Path) -> Positions:
         try:
             names.append(words[columns["image"]].strip().strip('"'))
             values.append([float(words[columns[key]]) for key in keys])
-        except (IndexError, ValueError) as error:
+        except (IndexError, ValueError, csv.Error) as error:
             raise InputError(
                 f"has no position in {line[:60]!r}.",
                 file=path,
@@ -139,10 +140,19 @@ def _named(line: str) -> dict[str, int]:
 def _splitter(line: str, path: Path) -> Any:
     for mark in (";", "\t", ","):
         if line.count(mark) >= 3:
-            return lambda text: [word.strip() for word in text.split(mark)]
+            return lambda text: _fields(text, mark)
     if line and len(line.split()) < 4:
         raise InputError(f"has too few columns in {line[:60]!r}.", file=path, remedy=_REMEDY)
     return str.split
+
+
+def _fields(line: str, mark: str) -> list[str]:
+    """Return the fields of a line; quotes may hold the mark."""
+    if '"' not in line:
+        return [word.strip() for word in line.split(mark)]
+    return [
+        word.strip() for word in next(csv.reader([line], delimiter=mark, skipinitialspace=True))
+    ]
 
 
 def match_names(images: Sequence[str], positions: Sequence[str]) -> list[tuple[int, int]]:

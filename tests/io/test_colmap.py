@@ -602,6 +602,114 @@ def test_rewrite_moves_points_and_cameras(tmp_path, scene, writer):
     assert model.points3D[5].track.length() == scene.tracks[4]
 
 
+def test_names_with_blanks_stay_whole(tmp_path, scene):
+    """RealityScan writes such names; pycolmap cuts them at the first blank."""
+    scene.names = [f"Dive 1, reef\u00e9/IMG ({i:04d}) copy.JPG" for i in range(25)]
+    folder = write_txt(tmp_path / "reef", scene)
+    text = (folder / "images.txt").read_bytes().replace(b"\n", b"\r\n")
+    text = text.replace(b"copy.JPG", "c\u00f6py.JPG".encode("latin-1"), 1)
+    (folder / "images.txt").write_bytes(b"# made by hand\r\n\r\n" + text)
+    xyz = scene.cameras + UTM
+    scene.names[0] = scene.names[0].replace("copy", "c\u00f6py").replace("\u00e9", "\u00c3\u00a9")
+    table = write_table(tmp_path / "positions.csv", scene, xyz)
+    rows = table.read_text().splitlines()
+    table.write_text("\n".join([rows[0], *(f'"{n}",{r[len(n) + 1:]}' for n, r in zip(
+        scene.names, rows[1:], strict=True))]) + "\n")  # fmt: skip
+    survey = colmap.read(folder, ReadOptions(positions=table))
+    assert absolute(survey) == pytest.approx(scene.world + UTM, abs=1e-6)
+    turn = Rotation.from_euler("zx", [30, 3], degrees=True).as_matrix()
+    move = make_mover(survey.source[0], Transform(turn, 1.01, [1, 2, 3], survey.centre), Frame())
+    colmap.rewrite(survey.source[0], move, tmp_path / "moved")
+    old = (folder / "images.txt").read_bytes().split(b"\r\n")
+    new = (tmp_path / "moved" / "images.txt").read_bytes().split(b"\r\n")
+    assert len(new) == len(old) == 4 + 2 * 25
+    names = 0
+    for before, after in zip(old, new, strict=True):
+        if before.endswith(b".JPG"):
+            names += 1
+            assert after != before
+            assert after.split(b" ", 8)[8] == before.split(b" ", 8)[8]  # camera and name
+        else:
+            assert after == before
+    assert names == 25
+    again = colmap.read(tmp_path / "moved", ReadOptions(up="z"))
+    assert absolute(again) == pytest.approx(
+        Transform(turn, 1.01, [1, 2, 3], survey.centre).apply(absolute(survey)), abs=1e-6
+    )
+
+
+@pytest.mark.parametrize("cut", ["IMG", "IMG (0003)"])
+def test_a_name_that_is_cut_in_writing_is_found(tmp_path, scene, cut, monkeypatch):
+    from meshreg.io import colmap_write
+
+    scene.names = [f"IMG ({i:04d}) copy.JPG" for i in range(25)]
+    survey = colmap.read(write_txt(tmp_path / "reef", scene), ReadOptions(scale=1))
+    kept = colmap_write._edited
+
+    def cutting(form, line, moved):
+        text = kept(form, line, moved)
+        return text.replace(b"IMG (0003) copy.JPG", cut.encode())
+
+    monkeypatch.setattr(colmap_write, "_edited", cutting)
+    move = make_mover(survey.source[0], Transform(offset=(1, 2, 3)), Frame())
+    with pytest.raises(OutputError, match="read back"):
+        colmap.rewrite(survey.source[0], move, tmp_path / "moved")
+    assert not (tmp_path / "moved").exists()
+
+
+@pytest.mark.parametrize("kind", ["txt", "bin"])
+def test_rigs_of_two_cameras_move_along(tmp_path, scene, kind):
+    """Every camera of a rig goes on seeing each point in the same pixel."""
+    import pycolmap
+
+    folder = write_txt(tmp_path / "reef", scene)
+    with open(folder / "cameras.txt", "a") as stream:
+        stream.write("2 PINHOLE 4000 3000 3e3 3e3 2e3 1500\n")
+    camera = (folder / "cameras.txt").read_text().replace("cameras: 1", "cameras: 2")
+    (folder / "cameras.txt").write_text(camera)
+    turn, shift = poses(scene)
+    aside, apart = Rotation.from_euler("xyz", [2, 20, -3], degrees=True), np.array([0.2, 0.1, 0.05])
+    lines = (folder / "images.txt").read_text().split("\n")
+    frames, rows = [], []
+    for i in range(24):
+        pose = Rotation.from_matrix(turn[i - i % 2])
+        where, number = shift[i - i % 2], i // 2 + 1
+        if i % 2:  # seen by the second camera
+            pose, where = aside * pose, aside.apply(where) + apart
+        numbers = [*pose.as_quat(scalar_first=True), *where]
+        text = " ".join(f"{v:.17g}" for v in numbers)
+        rows += [f"{i + 1} {text} {i % 2 + 1} {scene.names[i]}", lines[2 + 2 * i]]
+        if i % 2 == 0:
+            frames.append(f"{number} 1 {text} 2 CAMERA 1 {i + 1} CAMERA 2 {i + 2}")
+    rows += [f"25 {' '.join(lines[49].split()[1:8])} 1 {scene.names[24]}", lines[50]]
+    frames.append(f"13 1 {' '.join(lines[49].split()[1:8])} 1 CAMERA 1 25")
+    (folder / "images.txt").write_text("\n".join(rows) + "\n")
+    (folder / "frames.txt").write_text("\n".join(frames) + "\n")
+    numbers = [*aside.as_quat(scalar_first=True), *apart]
+    (folder / "rigs.txt").write_text(
+        f"# a rig\n1 2 CAMERA 1 CAMERA 2 1 {' '.join(f'{v:.17g}' for v in numbers)}\n"
+    )
+    if kind == "bin":
+        folder = tmp_path / "binary"
+        folder.mkdir()
+        pycolmap.Reconstruction(tmp_path / "reef").write_binary(folder)
+    survey = colmap.read(folder, ReadOptions(scale=UNIT))
+    turned = Rotation.from_euler("zx", [30, 3], degrees=True).as_matrix()
+    transform = Transform(turned, 1.25, [1, 2, 3], survey.centre)
+    move = make_mover(survey.source[0], transform, Frame())
+    written = colmap.rewrite(survey.source[0], move, tmp_path / "moved")
+    assert len(written) == 5
+    models = [pycolmap.Reconstruction(place) for place in (folder, tmp_path / "moved")]
+    seen = []
+    for model in models:
+        points = np.array([model.points3D[k + 1].xyz for k in range(100)])
+        poses_now = [model.images[k + 1].cam_from_world() for k in range(25)]
+        seen.append([pixels(p.rotation.matrix(), p.translation, points) for p in poses_now])
+    np.testing.assert_allclose(seen[1], seen[0], atol=1e-8)
+    sensor = models[1].rigs[1].sensor_from_rig(pycolmap.sensor_t(pycolmap.SensorType.CAMERA, 2))
+    assert sensor.translation == pytest.approx(1.25 * UNIT * apart, rel=1e-12)
+
+
 def test_rewrite_refuses_what_is_no_similarity(tmp_path, scene):
     survey = colmap.read(write_bin(tmp_path / "reef", scene), ReadOptions())
     shear = make_mover(survey.source[0], Transform(), Frame(np.diag([1.0, 1.0, 1.2])))
