@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import logging
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import cache
@@ -23,20 +23,29 @@ from meshreg.heading import (
     turned_as_voted,
 )
 from meshreg.heights import Heights, fit_heights
-from meshreg.offsets import ESTIMATORS, estimate_offset
+from meshreg.held_out import RAYLEIGH
+from meshreg.kriging import Ground
+from meshreg.offsets import ESTIMATORS, estimate_offset, neutral
 from meshreg.offsets.neutral import FieldsOf, pair_fields
-from meshreg.refine import Refined, dem_ground, refine, with_scale
+from meshreg.refine import PEAK_RESOLUTION, Refined, dem_ground, refine, with_scale
 from meshreg.settings import Settings
+from meshreg.tears import Tear, tear_of_tiles
+from meshreg.tiles import correlated_tiles
 from meshreg.types import (
     Float64,
     OffsetEstimate,
     Survey,
+    SurveyRaster,
     Transform,
 )
+from meshreg.verdict import Found, Stretch, findings, last_word
 from meshreg.voting import Turn, vote
 
 log = logging.getLogger(__name__)
 Progress = Callable[[str, float], None]
+TEAR_REACH = 1.0  # m that a part of a model may lie apart by and be found, in so many cells:
+TEAR_CELLS = (12, 24)
+TEAR_PART = 0.5  # cells: a smaller step is within what correlated tiles lean by
 Manual = Callable[[Transform | None], OffsetEstimate]
 
 
@@ -65,7 +74,11 @@ class Decision:
     ----------
     estimates : tuple of OffsetEstimate
     judgement : Judgement
-        With the doubts of the refinement in its verdict.
+        With what speaks against it in its verdict.
+    placed : Judgement
+        Of the place alone.
+    found : Found
+        What the rules of the verdict were asked about.
     refined : Refined or None
         From the moving survey as it was delivered; None when rejected.
     seconds : mapping
@@ -83,12 +96,14 @@ class Decision:
 
     estimates: tuple[OffsetEstimate, ...]
     judgement: judging.Judgement
+    placed: judging.Judgement
     refined: Refined | None
     seconds: Mapping[str, float]
     heights: Heights | None = None
     notes: tuple[str, ...] = ()
     motion: Transform | None = None
     scale: float = 1.0
+    found: Found = dataclasses.field(default_factory=Found)
 
     @property
     def transform(self) -> Transform | None:
@@ -165,21 +180,42 @@ def _in_frame(
             judgement = judging.judge(estimates, pairs, settings, radius, trials, maps.result())
     refined, heights = None, None
     notes: tuple[str, ...] = ()
+    placed, found = judgement, Found()
     if judgement.best is not None and judgement.verdict != "rejected":
         with clock.stage("refine"):
-            refined = _refine(judgement, pairs, settings, fields)
+            used = _supporting(judgement, pairs, settings)
+            agree = judging.agree_distance(settings.judge, pairs["dem"][0].grid.cell)
+            at = judgement.best.east, judgement.best.north
+            refined = refine(used, at, judgement.best.sigma, agree, fields)
+            tear = _torn(used, refined.offset, fields)
+            ground = dem_ground(*pairs["dem"], refined.offset)
+            fitted, own = with_scale(refined, ground)
+            stretch = _stretch(fitted, own, ground)
             if settings.search.free_scale or (motion is not None and motion.scale != 1.0):
-                ground = dem_ground(*pairs["dem"], refined.offset)
-                refined, scale = with_scale(refined, ground)
+                refined, scale, stretch = fitted, own, dataclasses.replace(stretch, fitted=True)
+            else:  # what was not fitted may be off by what a fit finds, and by what that may err
+                variance = (own - 1) ** 2 + fitted.scale_variance
+                refined = dataclasses.replace(refined, scale_variance=variance)
             if motion is not None:
                 refined, scale = as_delivered(refined, motion), scale * motion.scale
-            heights = fit_heights(*first["dem"], _horizontal(refined, scale), refined.offset_at)
-            judgement = judgement.doubted(refined.doubt).doubted(heights.doubt)
-        judgement, notes = on_heading_and_scale(
-            judgement, refined.yaw, scale, settings.search, turn, motion
+            horizontal = _horizontal(refined, scale)
+            heights = fit_heights(*first["dem"], horizontal, refined.offset_at)
+        scaled, notes = on_heading_and_scale(refined.yaw, scale, settings.search, turn, motion)
+        found = Found(
+            turned=refined.doubt,
+            tilted=heights.doubt,
+            scaled=scaled,
+            stretch=stretch,
+            gain=heights.gain,
+            tear=tear,
+            step=heights.step,
+            tilt=float(np.rad2deg(np.hypot(*heights.tilt))),
+            sigma_up=float(np.sqrt(max(heights.covariance[0, 0], 0.0))),
+            relief=heights.relief,
         )
-    told = (notes, motion, scale)
-    return Decision(tuple(estimates), judgement, refined, clock.seconds, heights, *told)
+        judgement = last_word(placed, findings(found))
+    told = (notes, motion, scale, found)
+    return Decision(tuple(estimates), judgement, placed, refined, clock.seconds, heights, *told)
 
 
 def _within(radius: float, estimate: OffsetEstimate) -> OffsetEstimate:
@@ -194,22 +230,55 @@ def _within(radius: float, estimate: OffsetEstimate) -> OffsetEstimate:
     )
 
 
-def _refine(
-    judgement: judging.Judgement, pairs: Pairs, settings: Settings, fields: FieldsOf
-) -> Refined:
+def _supporting(
+    judgement: judging.Judgement, pairs: Pairs, settings: Settings
+) -> list[tuple[SurveyRaster, SurveyRaster, neutral.Channel]]:
+    """Return the rasters of the channels that put the best offset first.
+
+    Others have tiles of chance.
+    """
     best = judgement.best
     assert best is not None
-    # a channel that does not put this offset first has tiles of chance: leave it out
     used = [
         (*pairs["dem" if name == "terrain" else "ortho"], name)
         for name in judgement.maps
         if best.gaps[name] >= settings.judge.support_gap
     ]
-    if not used:
-        used = [(*pairs["dem"], "terrain")]
-    agree = judging.agree_distance(settings.judge, pairs["dem"][0].grid.cell)
-    at = best.east, best.north
-    return refine(used, at, best.sigma, agree, fields)  # type: ignore[arg-type]
+    return used or [(*pairs["dem"], "terrain")]  # type: ignore[return-value]
+
+
+def _torn(
+    used: Sequence[tuple[SurveyRaster, SurveyRaster, neutral.Channel]],
+    offset: Float64,
+    fields: FieldsOf,
+) -> Tear | None:
+    """Find the largest tear that the tiles of a channel show, looked for further than a turn."""
+    tears = []
+    for reference, moving, channel in used:
+        cell = moving.grid.cell
+        reach = int(np.clip(np.ceil(TEAR_REACH / cell), *TEAR_CELLS))
+        at = float(offset[0]), float(offset[1])
+        tiles = correlated_tiles(reference, moving, channel, at, fields, reach)
+        found = None if tiles is None else tear_of_tiles(tiles, PEAK_RESOLUTION * cell)
+        if found is not None and found.size > TEAR_PART * cell:
+            tears.append(found)
+    return max(tears, key=lambda tear: tear.size, default=None)
+
+
+def _stretch(refined: Refined, scale: float, ground: Ground) -> Stretch:
+    """Put a fitted scale beside what it explains of the tiles' offsets and what it leaves."""
+    arm = ground.places - refined.pivot
+    corner = float(np.hypot(*arm.T).max())
+    explained, left = 0.0, float("inf")
+    if refined.tiles is not None and refined.residuals is not None:
+        tile = refined.tiles.places - refined.pivot
+        used = np.ones(len(tile), bool) if refined.weights is None else refined.weights > 0
+        rest = (refined.residuals - (scale - 1) * tile)[used]
+        rest = rest - np.median(rest, axis=0)
+        explained = abs(scale - 1) * float(np.sqrt((tile[used] ** 2).sum(axis=1).mean()))
+        left = float(np.median(np.hypot(*rest.T))) / RAYLEIGH[2] * np.sqrt(2)
+    sigma = float(np.sqrt(refined.scale_variance))
+    return Stretch(scale, sigma, abs(scale - 1) * corner, explained / max(left, 1e-9))
 
 
 def _horizontal(refined: Refined, scale: float = 1.0) -> Transform:

@@ -8,7 +8,6 @@ from functools import partial
 
 import numpy as np
 
-from meshreg.judge import Judgement
 from meshreg.refine import Refined
 from meshreg.settings import SearchSettings
 from meshreg.types import Float64, OffsetAt, SurveyRaster, Transform
@@ -58,18 +57,18 @@ def turned_as_voted(
 
 
 def on_heading_and_scale(
-    judgement: Judgement,
     yaw: float,
     scale: float,
     settings: SearchSettings,
     turn: Turn | None,
     motion: Transform | None,
-) -> tuple[Judgement, tuple[str, ...]]:
-    """Doubt a survey whose scale is plainly wrong, and tell what its heading is off by.
+) -> tuple[str, tuple[str, ...]]:
+    """Say that a scale is plainly wrong, which is a doubt, and what the heading is off by.
 
     `yaw` [rad] and `scale` are those of the whole answer; `motion` is how the survey was turned
     before the search.
     """
+    scaled = ""
     notes: tuple[str, ...] = ()
     turned = 0.0 if motion is None else yaw_of(motion)
     if abs(turned) > SMALL_YAW:
@@ -81,14 +80,13 @@ def on_heading_and_scale(
     if settings.free_scale and scale != 1.0:
         notes += (f"the moving survey's lengths are multiplied by {scale:.5f}",)
     elif scale != 1.0:
-        said = f"the moving survey is {_missized(scale)}: check the scale bars"
-        judgement = judgement.doubted(said)
+        scaled = f"the moving survey is {_missized(scale)}: check the scale bars"
     elif turn is not None and turn.mimics_scale:
         notes += (
             f"the moving survey seems {_missized(turn.stretch)}, which internal distortion "
             "can feign; its scale was left as it is",
         )
-    return judgement, notes
+    return scaled, notes
 
 
 def _missized(scale: float) -> str:

@@ -13,8 +13,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from meshreg.dem_pair import DemPair, points_of
-from meshreg.ground import MAD_TO_SIGMA
+from meshreg.gain import Gain, relief_gain
+from meshreg.ground import MAD_TO_SIGMA, block_grounds, numbered
 from meshreg.ground_plane import CHANGED, SET_ASIDE, STABLE, UNKNOWN, GroundPlane, fit_plane
+from meshreg.tears import Tear, find_tear
 from meshreg.types import Float64, Grid, OffsetAt, SurveyRaster, Transform, UInt8, Warp
 
 __all__ = [
@@ -30,6 +32,8 @@ __all__ = [
     "stable_ground",
 ]
 
+STEP_BLOCKS = 8  # along the overlap's side, whose heights are asked for a step
+STEP_CELLS = 0.02  # of a cell: no height of a block is better than this
 MAX_TILT = np.deg2rad(3.0)
 # m, sigma: how far sand may have risen or fallen where nothing tells; by then up is no better known
 # than by two depths of 5 cm each.
@@ -63,6 +67,12 @@ class Heights:
     ground : (H, W) uint8 or None
         What each cell of the moving DEM was: UNKNOWN, CHANGED, SET_ASIDE or STABLE. A stable cell
         has a weight of one, the others of nought; None where there was too little ground to tell.
+    gain : Gain or None
+        How many times as high the moving survey's relief is.
+    step : Tear or None
+        Two populations of the heights of recurring ground, which lie apart.
+    relief : float
+        Range of 98 % of the common cells' heights [m].
     """
 
     place: Float64
@@ -74,6 +84,9 @@ class Heights:
     note: str = ""
     doubt: str = ""
     ground: UInt8 | None = None
+    gain: Gain | None = None
+    step: Tear | None = None
+    relief: float = float("inf")
 
     def transform(self, horizontal: Transform) -> Transform:
         """Complete a horizontal registration: lifted by `up` and tilted about `place`."""
@@ -115,6 +128,50 @@ def fit_heights(
     horizontal: Transform,
     offset_at: OffsetAt | None = None,
 ) -> Heights:
+    """Lift and tilt of the moving survey (`fitted_plane`), its gain, and whether it is torn.
+
+    Parameters
+    ----------
+    reference, moving : SurveyRaster
+        DEMs as delivered, each on its own grid.
+    horizontal : Transform
+        `reference_from_moving` in east, north and yaw.
+    offset_at : callable, optional
+        ``offset_at(places)`` of places (N, 2) in the moving survey: how far the ground there must
+        go [m], (N, 2), internal warp included. Heights are compared there, where the same ground
+        is; without it, where the rigid motion leads.
+    """
+    pair = DemPair.of(reference, moving, horizontal, offset_at)
+    if not pair.row.size:
+        return Heights(horizontal.pivot, note="no heights in common; up is not known")
+    answer = fitted_plane(pair, horizontal)
+    transform = answer.transform(horizontal)
+    height = moving.height[pair.row, pair.col].astype(np.float64)
+    relief = float(np.subtract(*np.quantile(height, (0.99, 0.01))))
+    step = _height_step(pair, transform)
+    return replace(answer, gain=relief_gain(pair, transform), step=step, relief=relief)
+
+
+def _height_step(pair: DemPair, transform: Transform) -> Tear | None:
+    """Find two populations of height among blocks of recurring ground."""
+    recurs = pair.where_detail_recurs(transform)
+    row, col = pair.row[recurs.counts], pair.col[recurs.counts]
+    if not row.size:
+        return None
+    difference, points = pair.differences(transform)
+    difference, points = difference[recurs.counts], points[recurs.counts]
+    side = max(int(np.sqrt(np.ptp(row) * np.ptp(col))) // STEP_BLOCKS, 8)
+    lattice, number = numbered(row // side, col // side)
+    value, cells, _, _ = block_grounds(difference, number, len(lattice))
+    known = cells >= 0.25 * side**2
+    if not known.any():
+        return None
+    sums = [np.bincount(number, part, len(lattice)) for part in points[:, :2].T]
+    places = (np.stack(sums, axis=1) / cells[:, None])[known]
+    return find_tear(places, value[known, None], STEP_CELLS * pair.moving.grid.cell)
+
+
+def fitted_plane(pair: DemPair, horizontal: Transform) -> Heights:
     """Lift and tilt of the moving survey, from raw height differences.
 
     The difference ``dz = reference - moving`` at a moved cell is modelled as
@@ -136,14 +193,10 @@ def fit_heights(
 
     Parameters
     ----------
-    reference, moving : SurveyRaster
-        DEMs as delivered, each on its own grid.
+    pair : DemPair
+        With some cells in common.
     horizontal : Transform
         `reference_from_moving` in east, north and yaw.
-    offset_at : callable, optional
-        ``offset_at(places)`` of places (N, 2) in the moving survey: how far the ground there must
-        go [m], (N, 2), internal warp included. Heights are compared there, where the same ground
-        is; without it, where the rigid motion leads.
 
     Returns
     -------
@@ -151,10 +204,7 @@ def fit_heights(
         With the tilt at zero unless Hotelling's T² calls it significant at three sigmas (0.27 %);
         the covariance knows what that leaves out.
     """
-    pair = DemPair.of(reference, moving, horizontal, offset_at)
-    if not pair.row.size:
-        return Heights(horizontal.pivot, note="no heights in common; up is not known")
-    place = points_of(moving, pair.row, pair.col).mean(axis=0)
+    place = points_of(pair.moving, pair.row, pair.col).mean(axis=0)
     start = Heights(place)
     first = pair.differences(start.transform(horizontal))[0]
     start = replace(start, up=float(np.median(first)))

@@ -18,9 +18,9 @@ import numpy as np
 
 from meshreg import judge as judging
 from meshreg import statistics
-from meshreg.calibration import probability
 from meshreg.decision import Clock, Manual, Progress, completed, decide
 from meshreg.errors import UsageError
+from meshreg.gain import Gain
 from meshreg.heading import Pairs, turning
 from meshreg.heights import STABLE, Heights, stable_ground
 from meshreg.levels import lay_down, rasterize_pair
@@ -39,6 +39,7 @@ from meshreg.types import (
     Transform,
     Warp,
 )
+from meshreg.verdict import findings, last_word
 from meshreg.voting import Turn
 from meshreg.warp import Internal, check_model, measure
 from meshreg.warp_rasters import warped_raster
@@ -100,7 +101,7 @@ def register_pair(
     decision = decide(pairs, settings, radius, tell, manual, turned)
     clock.seconds.update(decision.seconds)
     notes += decision.notes
-    judgement, refined = decision.judgement, decision.refined
+    refined, found = decision.refined, decision.found
     if isinstance(moving.geometry, Maps) and decision.heights is not None:
         decision = dataclasses.replace(decision, heights=decision.heights.levelled())
     notes += [part.note for part in (refined, decision.heights) if part is not None and part.note]
@@ -127,6 +128,10 @@ def register_pair(
     with clock.stage("internal"):
         internal, rasters = _internal(refined, transform, rasters, settings)
     notes += [internal.said] if internal.said else []
+    against = findings(found) if transform is not None else ()
+    judgement = last_word(decision.placed, against)
+    if judgement.verdict != "accepted":  # how far off it may be is not known
+        covariance = error = None
     return Registration(
         verdict=judgement.verdict,
         reason=judgement.reason,
@@ -158,7 +163,8 @@ def register_pair(
         internal=internal.record or None,
         warp=internal.warp,
         false_alarm=judgement.false_alarm,
-        probability=None if judgement.best is None else probability(judgement.false_alarm),
+        findings=against,
+        heights_gain=_gain(found.gain),
         evidence=rasters
         | {
             "residuals": internal.evidence or _residuals(refined, transform),
@@ -171,6 +177,13 @@ def register_pair(
             },
         },
     )
+
+
+def _gain(gain: Gain | None) -> dict[str, float] | None:
+    """Return the gain of the heights for the record; None where no relief recurs."""
+    if gain is None or not np.isfinite(gain.sigma):
+        return None
+    return {"value": gain.value, "sigma": gain.sigma}
 
 
 def prepared(

@@ -99,8 +99,12 @@ def correlated_tiles(
     channel: neutral.Channel,
     offset: tuple[float, float],
     fields: neutral.FieldsOf = neutral.pair_fields,
+    least_reach: int = 0,
 ) -> TileOffsets | None:
-    """Match each tile by the neutral measure, within the reach of a yaw of ±1°."""
+    """Match each tile by the neutral measure, within the reach of a yaw of ±1° at least.
+
+    `least_reach` [cells] is how far it is looked for, where that is more.
+    """
     overlap = Overlap.at(reference.grid, moving.grid, offset)
     if overlap.side < 32:
         return None
@@ -108,6 +112,7 @@ def correlated_tiles(
     side = int(np.clip(overlap.side // 5, 16, 128))
     span = overlap.rows[1] - overlap.rows[0], overlap.cols[1] - overlap.cols[0]
     reach = int(np.ceil(0.5 * np.hypot(*span) * MAX_YAW)) + 3
+    reach = max(reach, least_reach)
     tiles = overlap.tiles(side)
 
     def matched(tile: tuple[int, int]) -> tuple[float, float] | None:

@@ -637,6 +637,14 @@ class OffsetEstimate:
             _put(self, "sigma", _frozen(self.sigma, np.float64, (2, 2), "OffsetEstimate.sigma"))
 
 
+@dataclass(frozen=True)
+class Finding:
+    """One thing that speaks against accepting a pair: a short code and a sentence for people."""
+
+    code: str
+    said: str
+
+
 @dataclass(frozen=True, eq=False)
 class Registration:
     """What was decided about a pair of surveys, with everything needed to check it.
@@ -650,8 +658,9 @@ class Registration:
         survey's bounding box; None when rejected, the best hypothesis when in review.
     covariance : (7, 7) float64 or None
         Of (east, north, up [m], tilt_east, tilt_north, yaw [rad], scale [-]) at the transform's
-        pivot; the angles are right-handed turns about the east, north and up axes. Rows of what
-        was not estimated are zero. The internal bending of the models is not in it.
+        pivot; the angles are right-handed turns about the east, north and up axes. A scale that
+        was not fitted has the variance of what it may be off by. The internal bending of the
+        models is not in it. None unless accepted: an answer that is not proven has no error bar.
     estimates : tuple of OffsetEstimate
     hypotheses : tuple of mappings
         Ranked candidates with their neutral scores.
@@ -670,9 +679,12 @@ class Registration:
     false_alarm : float or None
         Chance that unrelated ground would make the best hypothesis stand out as much, measured on
         the pair itself (`meshreg.judge`).
-    probability : float or None
-        That the best hypothesis is right, as calibrated on synthetic pairs alone
-        (`meshreg.calibration`).
+    findings : tuple of Finding
+        What later stages found against accepting the pair (`meshreg.verdict`), in the order of the
+        reason; empty where nothing was.
+    heights_gain : mapping or None
+        How many times as high the moving survey's relief is as the reference's: `value`, and
+        `sigma` of its natural logarithm (`meshreg.gain`); None where no relief recurs.
     warp : Warp or None
         The bend that was applied after the transform, where one was asked for and found.
     evidence : mapping
@@ -700,7 +712,8 @@ class Registration:
     internal: Mapping[str, Any] | None = None
     warp: Warp | None = None
     false_alarm: float | None = None
-    probability: float | None = None
+    findings: tuple[Finding, ...] = ()
+    heights_gain: Mapping[str, float] | None = None
 
     def __post_init__(self) -> None:
         if self.covariance is not None:

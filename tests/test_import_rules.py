@@ -33,7 +33,7 @@ RULES: dict[str, set[str]] = {
     "ground": BASE,
     "dem_pair": BASE | {"ground"},
     "ground_plane": BASE | {"dem_pair", "ground", "sandwich"},
-    "heights": BASE | {"dem_pair", "ground", "ground_plane"},
+    "heights": BASE | {"dem_pair", "gain", "ground", "ground_plane", "tears"},
     "open3d_loading": set(),
     "surfaces": BASE | {"open3d_loading", "sandwich"},
     "apply": BASE,
@@ -44,13 +44,17 @@ RULES: dict[str, set[str]] = {
     "warp": BASE | {"ladder", "tiles", "warp_rasters"},
     "statistics": BASE | {"raster", "offsets"},
     "offsets": BASE | {"jit", "kriging", "raster", "sandwich"},
-    "calibration": set(),
+    "gain": BASE | {"dem_pair"},
+    "tears": BASE | {"held_out", "tiles"},
+    "verdict": BASE | {"gain", "judge", "tears"},
     "judge": BASE | {"raster", "offsets"},
     "levels": BASE | {"offsets", "raster", "statistics"},
-    "decision": BASE | {"heading", "heights", "judge", "offsets", "refine", "statistics", "voting"},
+    "decision": BASE
+    | {"heading", "heights", "held_out", "judge", "kriging", "offsets", "refine", "statistics"}
+    | {"tears", "tiles", "verdict", "voting"},
     "pipeline": BASE
-    | {"calibration", "decision", "heading", "heights", "judge", "levels", "offsets", "raster"}
-    | {"refine", "statistics", "surfaces", "voting", "warp", "warp_rasters"},
+    | {"decision", "gain", "heading", "heights", "judge", "levels", "offsets", "raster"}
+    | {"refine", "statistics", "surfaces", "voting", "verdict", "warp", "warp_rasters"},
     "ties": BASE | {"io", "raster", "offsets", "statistics", "report"},
     "doctor": {"open3d_loading"},
 }

@@ -173,25 +173,6 @@ def test_the_budget_of_a_page_holds_at_its_worst() -> None:
 # ---- what it says -----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("value", "said"),
-    [
-        (0.9871, "98.7%"), (0.5, "50.0%"), (0.9999, "over 99.9%"), (1.0, "over 99.9%"),
-        (0.0, "under 0.1%"), (None, None), (math.nan, None),
-    ],
-)  # fmt: skip
-def test_probability_is_said_with_where_it_comes_from(
-    value: float | None, said: str | None
-) -> None:
-    registration = dataclasses.replace(made_registration("accepted"), probability=value)
-    assert words.probability(registration) == said
-    top = Page(answer.verdict(Result(registration, {}))).text
-    assert ("calibrated on synthetic pairs" in top) == (said is not None)
-    assert said is None or said in top
-    paragraph = words.methods_paragraph(registration)
-    assert ("calibrated on synthetic pairs" in paragraph) == (said is not None)
-
-
 def test_what_the_bending_leaves_is_said_beside_the_sigmas() -> None:
     parts = {
         "horizontal": {"held_out_rigid": 0.0766, "held_out": 0.0123},

@@ -143,8 +143,5 @@ def _write(summary: Mapping[str, Any], rows: Sequence[tables.Row], folder: Path)
                 target.unlink(missing_ok=True)
             else:
                 maps.save(figure, target)
-        with atomic_file(folder / "calibration.json") as path:
-            text = json.dumps(tables.calibrated(rows), indent=1, allow_nan=False)
-            path.write_text(text + "\n", encoding="utf-8")
         with atomic_file(folder / "index.html") as path:
             path.write_text(page.write_page(summary, folder), encoding="utf-8")

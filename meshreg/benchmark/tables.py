@@ -238,27 +238,6 @@ def stages(records: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     return lines
 
 
-def calibrated(rows: Iterable[Row]) -> Mapping[str, Any]:
-    """Fit the probability of a right answer to the fused answers of the pairs whose truth is known.
-
-    Pairs of a recipe as it stands are left out: they are made to be hard in one way.
-    """
-    from meshreg.calibration import fit
-
-    used = [
-        row
-        for row in fused(rows)
-        if row["preset"] == "robust"
-        and row["kind"] in ("crossing", "ladder", "elsewhere")
-        and row.get("false_alarm") is not None
-    ]
-    return fit(
-        [row["false_alarm"] for row in used],
-        [bool(row.get("success")) for row in used],
-        [row["kind"] != "elsewhere" for row in used],
-    )
-
-
 def not_flat(rows: Iterable[Row]) -> list[Row]:
     """Return the rows of the crossing on ground other than flat sand."""
     return [row for row in rows if row["kind"] == "crossing" and row["ground"] != FLAT]

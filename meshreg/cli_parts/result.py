@@ -10,9 +10,8 @@ from rich.markup import escape
 from rich.panel import Panel
 from rich.table import Table
 
-from meshreg.calibration import basis
 from meshreg.cli_parts.console import Voice
-from meshreg.report.words import next_steps, probability
+from meshreg.report.words import next_steps
 from meshreg.types import OffsetEstimate, Registration
 
 _COLORS = {"accepted": "green", "review": "yellow", "rejected": "red"}
@@ -27,8 +26,6 @@ def show(registration: Registration, out: Path, voice: Voice) -> None:
     voice.say(f"[bold {color}]{registration.verdict.upper()}[/]: {escape(reason)}")
     if registration.transform is not None:
         _print_offset(registration, voice)
-    if (right := probability(registration)) is not None:
-        voice.say(f"probability of being right: {right} ({basis()})")
     voice.out.print(_methods(registration))
     for estimate in registration.estimates:
         if estimate.reason:

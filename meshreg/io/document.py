@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from meshreg.errors import InputError, UsageError
-from meshreg.types import OffsetEstimate, Registration, Transform, Warp
+from meshreg.types import Finding, OffsetEstimate, Registration, Transform, Warp
 
 SCHEMA = "meshreg.registration/1"
 MAX_BYTES = 64_000_000  # a real record has some 20 kB
@@ -54,7 +54,8 @@ def registration_document(registration: Registration) -> dict[str, Any]:
         "covariance": None if covariance is None else covariance.tolist(),
         "registration_error": registration.registration_error,
         "false_alarm": registration.false_alarm,
-        "probability": registration.probability,
+        "findings": [{"code": f.code, "said": f.said} for f in registration.findings],
+        "heights_gain": registration.heights_gain,
         "internal": registration.internal,
         "warp": None if registration.warp is None else _warp_document(registration.warp),
         "methods": {e.method: _estimate_document(e) for e in registration.estimates},
@@ -259,7 +260,11 @@ def _registration(document: dict[str, Any], path: Path) -> Registration:
             registration_error=document.get("registration_error"),
             internal=document.get("internal"),
             false_alarm=document.get("false_alarm"),
-            probability=document.get("probability"),
+            findings=tuple(
+                Finding(str(item["code"]), str(item["said"]))
+                for item in document.get("findings") or ()
+            ),
+            heights_gain=document.get("heights_gain"),
             warp=_warp(document.get("warp")),
         )
     except UsageError as error:  # a record refused at birth; here the file is to blame

@@ -43,17 +43,14 @@ def _numbers(result: Result) -> str:
         for name, value, sigma in zip(
             ("East", "North", "Up"), r.transform.offset.tolist(), sigmas[:3], strict=True
         ):
-            rows.append((name, f"{number(value)} m", f"± {number(sigma, '.3f')} m"))
+            rows.append((name, f"{number(value)} m", _within(number(sigma, ".3f"), " m")))
         yaw = f"{number(words.yaw_degrees(r), '+.3f')}°"
-        rows.append(("Yaw", yaw, f"± {number(sigmas[3], '.3f')}°, anticlockwise"))
+        error = _within(number(sigmas[3], ".3f"), "°")
+        rows.append(("Yaw", yaw, f"{error}, anticlockwise" if error else "anticlockwise"))
         if (tilt := words.tilt_degrees(r)) > 0:
             rows.append(("Tilt", f"{number(tilt, '.3f')}°", "from the vertical"))
         if (scale := f"{r.transform.scale:.5f}") != f"{1:.5f}":
             rows.append(("Scale", scale, "times the moving survey's lengths"))
-    if (probability := words.probability(r)) is not None:
-        what = "it" if r.verdict == "accepted" else "the best hypothesis"
-        more = f"that {what} is right; calibrated on synthetic pairs"
-        rows.append(("Probability", probability, more))
     compared = r.after or r.before
     if compared.get("overlap") is not None:
         more = "of the smaller survey" + ("" if r.after else ", as delivered")
@@ -72,9 +69,12 @@ def _numbers(result: Result) -> str:
     note = ""
     if r.transform is not None:
         best = "The best hypothesis, not accepted. " if r.verdict == "review" else ""
+        stated = "; ± is one sigma of the rigid move"
+        if r.covariance is None:
+            stated = "; an answer that is not accepted has no stated error"
         note = (
             f'<p class="soft">{best}What is added to the moving survey, at the centre of its '
-            "bounding box; ± is one sigma of the rigid move.</p>"
+            f"bounding box{stated}.</p>"
         )
     return f'{note}<dl class="numbers">{cells}</dl>' if rows else ""
 
@@ -92,6 +92,11 @@ def _internal(result: Result) -> list[tuple[str, str, str]]:
     more = "after the warp" if applied else "the models' bending, not in ±"
     up = "" if left[1] == number(None) else f", {left[1]} m up"
     return [("Left in the tiles, rms", f"{left[0]} m", f"horizontally{up}: {more}")]
+
+
+def _within(sigma: str, unit: str) -> str:
+    """Return "± sigma", or nothing where none is stated."""
+    return "" if sigma == number(None) else f"± {sigma}{unit}"
 
 
 def _chance(alarm: float) -> str:

@@ -19,6 +19,7 @@ _LOOK = (
     "other, do not use the registered survey."
 )
 # What the reason says, and what helps. `{wider}` is twice the search radius.
+_UP_UNKNOWN = 0.14  # m; two depths of 5 cm each, as where nothing tells what sand did
 _ADVICE: tuple[tuple[str, tuple[str, ...]], ...] = (
     (
         r"lie .* apart",
@@ -86,6 +87,55 @@ _ADVICE: tuple[tuple[str, tuple[str, ...]], ...] = (
         (
             "The lengths of the surveys differ. Check the scale bars or camera positions of the "
             "model that is wrong, and make it again; growth does not stretch the ground.",
+        ),
+    ),
+    (
+        r"times those of the other",
+        (
+            "Export both models with heights and plan in the same unit (--unit m, ft, ...; "
+            'unit = "ft" in a NAME.survey.toml beside the file that differs), without vertical '
+            "exaggeration. A GeoTIFF's heights may be in feet though its plan is in metres.",
+        ),
+    ),
+    (
+        r"second copy of its surface",
+        (
+            "Parts of the model do not lie on each other, as after an alignment of images or scans "
+            "in two groups. Align all of them in one block, or leave one group out, and export "
+            "again.",
+        ),
+    ),
+    (
+        r"torn, or slid",
+        (
+            "Look along that part's border in report.html. If a model is torn there, align its "
+            "images again with more ties between both parts; if the ground has slid, mask the part "
+            "that did (--mask not:FILE).",
+        ),
+    ),
+    (
+        r"stands? upright",
+        (
+            "Seen from above a steep wall shows nothing. Turn both models by the same known "
+            "rotation, so that the wall lies level, and register those.",
+        ),
+    ),
+    (
+        r"the answer tilts",
+        (
+            "Align both models to the vertical in the software that made them, or check --up and "
+            "--axes of each file.",
+        ),
+    ),
+    (
+        r"more than the whole relief",
+        ("Check the height's unit and datum of both files. " + _LOOK,),
+    ),
+    (
+        r"tie points",
+        (
+            "Look at the points with the largest residuals in `meshreg validate OUT ties.csv`: "
+            "either they are not of the same feature, or the answer is wrong. " + _LOOK,
         ),
     ),
     (
@@ -168,16 +218,22 @@ def methods_paragraph(registration: Registration) -> str:
         if raster.get(name)
     ]
     radius = _of(settings, "search", "radius")
+    done = {
+        "accepted": "was registered to",
+        "review": "was compared, for a registration that is not accepted, with",
+        "rejected": "could not be registered to",
+    }[r.verdict]
+    refined = ", and the best was refined on tiles" if r.transform is not None else ""
     parts = [
-        f"The survey {_name(r.moving, 'moving')} ({_files(r.moving)}) was registered to the "
+        f"The survey {_name(r.moving, 'moving')} ({_files(r.moving)}) {done} the "
         f"survey {_name(r.reference, 'reference')} ({_files(r.reference)}) with meshreg {meshreg} "
         f"(preset {settings.get('preset', 'robust')}, seed {settings.get('seed', 0)}), which "
         f"follows {PAPER}.",
         f"Both were rasterized from above to {' and '.join(cells)}"
         f"{_crs(r.reference.get('crs'))}." if cells else "",
         f"Horizontal offsets within ±{radius:g} m were searched by {_listed(names)}; the proposals "
-        "were weighed against relief and image of the whole overlap, and the best was refined on "
-        "tiles." if radius and names else "",
+        f"were weighed against relief and image of the whole overlap{refined}."
+        if radius and names else "",
         _outcome(r),
         _agreement(r),
         "Software: "
@@ -239,36 +295,64 @@ def tilt_degrees(registration: Registration) -> float:
     return math.degrees(math.hypot(*transform.rotation[:2, 2]))  # its sine, for so small an angle
 
 
-def probability(registration: Registration) -> str | None:
-    """Return the probability that the best hypothesis is right, never rounded to certainty."""
-    value = registration.probability
-    if value is None or not math.isfinite(value):
-        return None
-    if value > 0.999:
-        return "over 99.9%"
-    return "under 0.1%" if value < 0.001 else f"{value:.1%}"
-
-
 def _outcome(r: Registration) -> str:
+    reason = r.reason.strip().rstrip(".")
     if r.transform is None:
-        return f"No registration was accepted: {r.reason.strip().rstrip('.')}."
+        return f"No registration was accepted: {reason}."
     moves = [
-        f"{number(value, '+.4f')} ± {number(sigma, '.4f')} m {name}"
+        f"{number(value, '+.4f')}{_stated(sigma)} m {name}"
         for name, value, sigma in zip(
             ("east", "north", "up"), r.transform.offset.tolist(), sigmas(r)[:3], strict=True
         )
     ]
     tilt = tilt_degrees(r)
     tilted = f", tilts it by {tilt:.4f}°" if tilt > 0 else ""
-    word = {"accepted": "accepted", "review": "held for review, not accepted"}[r.verdict]
-    chance = probability(r)
-    sure = f"The probability that it is right is {chance} (calibrated on synthetic pairs)."
-    return (
-        f"The registration was {word}: {r.reason.strip().rstrip('.')}. "
-        f"{f'{sure} ' if chance else ''}It moves the survey by {_listed(moves)}{tilted} and "
-        f"turns it by {number(yaw_degrees(r), '+.4f')} ± "
-        f"{number(sigmas(r)[3], '.4f')}° about the centre of its bounding box (one sigma)."
-    )
+    known = "(one sigma)" if r.covariance is not None else "(no error is stated)"
+    where = f"about the centre of its bounding box {known}"
+    turn = f"turns it by {number(yaw_degrees(r), '+.4f')}{_stated(sigmas(r)[3])}° {where}"
+    if r.verdict == "review":
+        return (
+            f"The registration is held for review, not accepted: {reason}. The best hypothesis "
+            f"would move the survey by {_listed(moves)}{tilted}; it {turn}."
+        )
+    said = f"The registration was accepted: {reason}. It moves the survey by {_listed(moves)}"
+    return " ".join([f"{said}{tilted} and {turn}.", *undetermined(r), *_warped(r)])
+
+
+def _stated(sigma: float) -> str:
+    return f" ± {number(sigma, '.4f')}" if math.isfinite(sigma) else ""
+
+
+def undetermined(r: Registration) -> list[str]:
+    """Sentences that name what of an accepted answer the data did not tell."""
+    if r.transform is None or r.covariance is None:
+        return []
+    said = []
+    yaw, sigma = yaw_degrees(r), sigmas(r)
+    if abs(yaw) < 1e-9 and math.isfinite(sigma[3]):
+        said.append(
+            f"The yaw was not determined: no turn stood out of its error of {sigma[3]:.4f}°."
+        )
+    nmad = [float(side.get("height_nmad") or math.nan) for side in (r.before, r.after)]
+    worse = nmad[1] >= nmad[0]  # of what is not known nothing is said
+    if sigma[2] > _UP_UNKNOWN or (worse and sigma[2] > 0.5 * nmad[1]):
+        said.append(
+            f"The height was not determined: up is known to ± {sigma[2]:.2g} m"
+            + (" and the heights agree no better than before." if worse else " only.")
+        )
+    return said
+
+
+def _warped(r: Registration) -> list[str]:
+    """Say that a bend was applied after the rigid motion, and which."""
+    if r.warp is None:
+        return []
+    parts = [f"{r.warp.horizontal} horizontally"] if r.warp.horizontal != "rigid" else []
+    parts += [f"{r.warp.vertical} in height"] if r.warp.vertical != "rigid" else []
+    return [
+        f"The survey was then bent by a smooth warp ({' and '.join(parts)}) that predicts "
+        "held-out tiles better than the rigid motion."
+    ]
 
 
 def _agreement(r: Registration) -> str:
@@ -287,12 +371,17 @@ def _agreement(r: Registration) -> str:
 
 
 def _compared(r: Registration) -> str:
+    if r.verdict == "rejected":
+        return ""
     overlap, after = r.after.get("overlap"), r.after.get("height_nmad")
     if overlap is None or after is None or not math.isfinite(after):
         return ""
+    done = "registration and warp" if r.warp is not None else "registration"
+    if r.verdict == "review":
+        done = "the motion under review"
     before = r.before.get("height_nmad")
     earlier = f" ({before:.3f} m before)" if before is not None and math.isfinite(before) else ""
     return (
-        f"After registration {overlap:.0%} of the smaller survey overlap, and the NMAD of the "
+        f"After {done} {overlap:.0%} of the smaller survey overlap, and the NMAD of the "
         f"height differences there is {after:.3f} m{earlier}."
     )
