@@ -15,9 +15,11 @@ from meshreg.io.safe import (
     MissingReferenceError,
     atomic_file,
     copy_file,
+    decode_name,
     open_regular,
     resolve_reference,
 )
+from meshreg.io.udim import has_token, tile_pages
 from meshreg.types import SourceFile
 
 _LIBRARY = re.compile(rb"(?m)^([ \t]*mtllib[ \t]+)([^\r\n]*?)([ \t]*\r?)$")
@@ -80,7 +82,20 @@ def write_libraries(source: SourceFile, path: Path) -> None:
 def _new_map(source: SourceFile, folder: Path, found: re.Match[bytes]) -> bytes:
     start = name_start(found[1].strip(), found[2])
     name = found[2][start:]
-    return found[1] + found[2][:start] + _or_same(source, folder, name) + found[3]
+    new = _new_pattern(source, folder, name) or _or_same(source, folder, name)
+    return found[1] + found[2][:start] + new + found[3]
+
+
+def _new_pattern(source: SourceFile, folder: Path, name: bytes) -> bytes | None:
+    """Return a name that stands for many pages (<UDIM>) as their copies are called, or None."""
+    if not has_token(text := decode_name(name)):
+        return None
+    for page in tile_pages(folder, text, source.path.parent).values():
+        if (new := source.copies.get(page)) is not None:
+            before = PurePosixPath(new).name.removesuffix(page.name)
+            cut = max(name.rfind(b"/"), name.rfind(b"\\")) + 1
+            return name[:cut] + os.fsencode(before) + name[cut:]
+    return None
 
 
 def _or_same(source: SourceFile, folder: Path, name: bytes) -> bytes:

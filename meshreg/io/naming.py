@@ -34,7 +34,7 @@ def planned(survey: Survey, suffix: str) -> tuple[Planned, ...]:
 
     A moved file is called as the source with `suffix`, and a number where an earlier block has
     that name. Texture pages and material files keep their names; of two that would meet, the
-    later is called after its survey file, and what refers to it is rewritten.
+    later's block has them called after its survey file, and what refers to them is rewritten.
     """
     plan = []
     taken: set[str] = set()
@@ -48,22 +48,32 @@ def planned(survey: Survey, suffix: str) -> tuple[Planned, ...]:
         copied = () if source.format in ("maps", "colmap") else source.companions
         inside = [file for file in copied if file.is_relative_to(folder)]
         # material files last: one that names a renamed page is a file of its own
-        for companion in sorted(inside, key=lambda file: file.suffix.lower() == ".mtl"):
-            place = PurePosixPath(companion.relative_to(folder).as_posix())
-            alone = companion.suffix.lower() == ".mtl" and bool(renamed)
-            target = names.get(companion, place)
-            stem = re.sub(r"[^A-Za-z0-9.-]+", "_", short_name(Path(name).stem, 60))
-            number = 0
-            while not _may_be(target, companion, copies, alone):
-                number += 1
-                more = f"_{number}" if number > 1 else ""
-                target = place.with_name(f"{stem}{more}_{place.name}")
-            copies.setdefault(_folded(target), companion)
-            names[companion] = target
-            if target != place:
-                renamed[companion] = str(target)
+        for last in (False, True):
+            group = [file for file in inside if (file.suffix.lower() == ".mtl") == last]
+            new = [file for file in dict.fromkeys(group) if file not in names]
+            alone = last and bool(renamed)
+            for number in range(len(copies) + 3):
+                targets = {file: _target(file.relative_to(folder), name, number) for file in new}
+                # all or none of them: the pages of one material may be told by their number only
+                if all(_may_be(target, file, copies, alone) for file, target in targets.items()):
+                    break
+            names |= targets
+            copies |= {_folded(target): file for file, target in targets.items()}
+            for file in group:
+                if names[file] != PurePosixPath(file.relative_to(folder).as_posix()):
+                    renamed[file] = str(names[file])
         plan.append(Planned(replace(source, copies=renamed), name))
     return tuple(plan)
+
+
+def _target(place: Path, name: str, number: int) -> PurePosixPath:
+    """Return where a companion's copy goes: its own place, or one with the survey file's name."""
+    here = PurePosixPath(place.as_posix())
+    if number == 0:
+        return here
+    stem = re.sub(r"[^A-Za-z0-9.-]+", "_", short_name(Path(name).stem, 60))
+    more = f"_{number}" if number > 1 else ""
+    return here.with_name(f"{stem}{more}_{here.name}")
 
 
 def _may_be(target: PurePosixPath, companion: Path, copies: dict[str, Path], alone: bool) -> bool:

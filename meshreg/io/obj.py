@@ -6,6 +6,7 @@ points, curves and normals of the file are not used; normals are turned when it 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from meshreg.errors import InputError, UnsafeReferenceError
+from meshreg.io import udim
 from meshreg.io.assemble import (
     Found,
     RawGeometry,
@@ -163,6 +165,14 @@ def _triangles(path: Path, found: Scan) -> Triangles:
     return triangulate(found.points, found.sizes, found.vertex, path)
 
 
+@dataclass(frozen=True)
+class Tiles:
+    """Pages of a material by tile (u, v); `first` is its page among the textures, or -1."""
+
+    pages: Mapping[tuple[int, int], Path]
+    first: int
+
+
 @dataclass
 class _Drape:
     """Finds the texture pages of a file's materials and lays them on its faces."""
@@ -175,6 +185,7 @@ class _Drape:
     _pages: dict[tuple[Path, bool], int] = field(default_factory=dict)
     _slots: dict[str, int] = field(default_factory=dict)  # material -> row of the two below
     _page: list[int] = field(default_factory=list)
+    _tiles: list[Tiles | None] = field(default_factory=list)  # where a page has several
     _change: list[tuple[float, float, float, float]] = field(default_factory=list)
 
     @property
@@ -196,6 +207,7 @@ class _Drape:
             if material.name in used:
                 self._slots[material.name] = len(self._page)
                 self._page.append(page)
+                self._tiles.append(self._tiles_of(material, library, page))
                 self._change.append(material.change)
         unknown = [name for name in used if name not in materials]
         if unknown and found.libraries:
@@ -232,13 +244,19 @@ class _Drape:
 
     def _page_of(self, material: Material, library: Path, used: bool) -> int:
         """Return the number of a material's texture page, -1 for none that can be used."""
-        for name in material.others:
+        for name in (*material.others, material.page or ""):
+            if udim.has_token(name):  # copied whether a face needs them or not
+                pages = udim.tile_pages(library.parent, name, self.path.parent)
+                self._companions.update(dict.fromkeys(pages.values()))
+                continue
+            if name not in material.others:
+                continue  # the page itself, of which below
             try:
                 other = resolve_reference(library.parent, name, root=self.path.parent)
             except InputError:  # never opened, so not worth a word
                 continue
             self._companions[other] = None
-        if material.page is None:
+        if material.page is None or udim.has_token(material.page):
             return -1
         try:
             path = resolve_reference(library.parent, material.page, root=self.path.parent)
@@ -246,12 +264,7 @@ class _Drape:
             if not used:
                 return -1
             self._noted(path, material.page)
-            key = (path, material.clamp)
-            if key not in self._pages:
-                texture = open_texture(path, self.options.max_pixels, material.clamp, self.notes)
-                self._pages[key] = len(self.textures)
-                self.textures.append(texture)
-            return self._pages[key]
+            return self._opened(path, material.clamp)
         except UnsafeReferenceError as error:
             error.file, error.place = str(library), material.place
             raise
@@ -262,10 +275,85 @@ class _Drape:
             )
             return -1
 
+    def _opened(self, path: Path, clamp: bool) -> int:
+        """Return the number of a texture page; its header is read the first time."""
+        key = (path, clamp)
+        if key not in self._pages:
+            texture = open_texture(path, self.options.max_pixels, clamp, self.notes)
+            self._pages[key] = len(self.textures)
+            self.textures.append(texture)
+        return self._pages[key]
+
+    def _tiles_of(self, material: Material, library: Path, page: int) -> Tiles | None:
+        """Find the pages of a material that has one for each tile of texture coordinates."""
+        name = material.page
+        if name is None or not (udim.has_token(name) or udim.first_tile(name)):
+            return None
+        pages = udim.tile_pages(library.parent, name, self.path.parent)
+        if not udim.has_token(name) and len(pages) < 2:
+            return None
+        if not pages:
+            self.notes.append(
+                f"Texture page {name!r} cannot be used (no page of that pattern is there): the "
+                "faces of its material have NO TEXTURE."
+            )
+        return Tiles(pages, page)
+
+    def _lay_tiles(self, slot: Int32, uv: Float32, page: Int32) -> bool:
+        """Give faces the page of their tile, and coordinates within it; in place.
+
+        Returns
+        -------
+        bool
+            Whether there were any such faces: some pages may be without a face then.
+        """
+        laid = False
+        for number, tiles in enumerate(self._tiles):
+            faces = np.flatnonzero(slot == number) if tiles is not None else ()
+            if tiles is None or not len(faces):
+                continue
+            middle = uv[faces].mean(axis=1)
+            finite = np.isfinite(middle).all(axis=1) & (np.abs(middle) < 1e6).all(axis=1)
+            tile = np.floor(np.where(finite[:, None], middle, 0)).astype(np.int64)
+            if tiles.first >= 0 and not tile.any():
+                continue  # one page, whatever lies beside it
+            laid = True
+            self._companions.update(dict.fromkeys(tiles.pages.values()))
+            bare: set[tuple[int, int]] = set()
+            for u, v in np.unique(tile, axis=0).tolist():
+                here = faces[(tile == (u, v)).all(axis=1)]
+                found = self._page_of_tile(tiles, (u, v))
+                page[here] = found
+                uv[here] -= np.array([u, v], np.float32)
+                if found < 0:
+                    bare.add((u, v))
+            if bare:
+                shown = ", ".join(map(str, sorted(bare)[:5]))
+                self.notes.append(
+                    f"There is no texture page for {len(bare)} tiles of texture coordinates "
+                    f"({shown}{', ...' if len(bare) > 5 else ''}): their faces have NO TEXTURE."
+                )
+
+        return laid
+
+    def _page_of_tile(self, tiles: Tiles, tile: tuple[int, int]) -> int:
+        path = tiles.pages.get(tile)
+        if path is None:
+            return -1
+        try:
+            return self._opened(path, True)
+        except InputError as error:
+            self.notes.append(
+                f"Texture page {path.name!r} cannot be used ({error.message[:-1]}): the faces of "
+                "its tile have NO TEXTURE."
+            )
+            return -1
+
     def lay(self, found: Scan, triangles: Triangles) -> tuple[Float32 | None, Int32 | None]:
         """Return uv (F, 3, 2) and page (F,) of all triangles; None where nothing has a page."""
-        if not self.textures or found.uv is None:
-            if self.textures:
+        tiled = any(tiles is not None and tiles.pages for tiles in self._tiles)
+        if not (self.textures or tiled) or found.uv is None:
+            if self.textures or tiled:
                 self.notes.append("No face has texture coordinates: there is no texture.")
                 self.textures = []
             return None, None
@@ -276,7 +364,10 @@ class _Drape:
         require_pages_near(self.path, found.uvs)
         starts = [at for at, _ in found.materials]
         slots = [self._slots.get(name, -1) for _, name in found.materials]
-        slots = [slot if slot >= 0 and self._page[slot] >= 0 else -1 for slot in slots]
+        slots = [
+            slot if slot >= 0 and (self._page[slot] >= 0 or self._tiles[slot] is not None) else -1
+            for slot in slots
+        ]
         runs = np.diff([0, *starts, n_faces])
         slot = triangles.pick_faces(np.repeat(np.array([-1, *slots], np.int32), runs))
         corners = np.ascontiguousarray(triangles.pick_corners(found.uv))
@@ -287,6 +378,12 @@ class _Drape:
                 f"{without} faces of a textured material have no usable texture coordinates."
             )
         page = np.array([*self._page, -1], np.int32)[slot]
+        if self._lay_tiles(slot, uv, page):
+            used, numbers = np.unique(page, return_inverse=True)
+            self.textures = [self.textures[number] for number in used if number >= 0]
+            page = numbers.astype(np.int32) - np.int32(used[0] < 0)
+            if not self.textures:
+                return None, None
         return uv, page
 
 
