@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
-import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,7 +18,8 @@ from data_synth.regions import describe_change
 from data_synth.scene import Scene, Take, View, make_scene
 from data_synth.seeing import Lattice
 from data_synth.truth import make_truth
-from meshreg.errors import OutputError, UsageError
+from meshreg.errors import UsageError
+from meshreg.io.atomic import as_output_error, atomic_folder
 from meshreg.types import Survey
 
 Progress = Callable[[str, float], None]
@@ -102,32 +101,18 @@ def write_pair(
     Raises
     ------
     UsageError
-        An unknown format, or the folder exists and `overwrite` is not set.
+        An unknown format, or the folder exists and `overwrite` is not set, or it holds anything
+        but a pair that was made before.
     OutputError
         Something could not be written; what was there before is intact.
     """
     folder, kind = Path(folder), format or recipe.output.format
     if kind not in FORMATS:
         raise UsageError(f"Unknown format {kind!r}.", remedy=f"Use one of {', '.join(FORMATS)}.")
-    if folder.exists() and not overwrite:
-        raise UsageError("exists already.", file=folder, remedy="Choose another, or overwrite it.")
-    if folder.is_dir() and any(folder.iterdir()) and not (folder / "truth.json").is_file():
-        raise UsageError("holds something else than a made pair.", file=folder)
-    try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        work = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
-    except OSError as error:
-        raise OutputError(f"cannot be made: {error}.", file=folder) from error
-    try:
+    with as_output_error(folder):
+        folder.absolute().parent.mkdir(parents=True, exist_ok=True)
+    with atomic_folder(folder, overwrite, ("truth.json",), "synth") as work:
         files = _write_all(recipe, work, seed, size, kind, progress or _silent)
-        if folder.exists():
-            shutil.rmtree(folder)
-        work.chmod(0o755)
-        work.replace(folder)
-    except OSError as error:
-        raise OutputError(f"cannot be written: {error}.", file=folder) from error
-    finally:
-        shutil.rmtree(work, ignore_errors=True)
     return tuple(folder / file.relative_to(work) for file in files)
 
 

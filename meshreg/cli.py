@@ -159,6 +159,7 @@ def register(
         settings,
         overwrite,
         ties,
+        config,
     )
     registration = _done(
         as_json,
@@ -239,7 +240,7 @@ def rasterize(
         positions=positions,
         geometry_only=geometry_only,
     )
-    request = mapping.RasterizeRequest(named, out, tuple(mask or ()), settings, overwrite)
+    request = mapping.RasterizeRequest(named, out, tuple(mask or ()), settings, overwrite, config)
     _done(
         as_json,
         lambda voice, unfinished: mapping.rasterize(request, voice, unfinished),
@@ -417,6 +418,7 @@ def selftest(
         settings,
         count,
         overwrite,
+        config,
     )
     document = _done(
         as_json,

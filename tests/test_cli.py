@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import io
 import json
 import logging
@@ -408,6 +409,99 @@ def test_a_folder_of_somebody_elses_is_never_replaced(
     precious.write_text("mine")
     assert run("register", *pair, "-o", precious.parent, "--overwrite")[0] == 2
     assert precious.read_text() == "mine"
+
+
+@pytest.mark.parametrize(
+    "kind", ["reference", "moving", "texture", "side file", "ties", "mask", "config", "notes"]
+)
+def test_an_input_in_the_old_result_is_never_removed(
+    tmp_path: Path, pair: tuple[str, str], run: Run, verdict: Any, kind: str
+) -> None:
+    """Whatever is read, whether meshreg wrote it or not: refused with its name, and all stays."""
+    verdict("accepted")
+    out = tmp_path / "out"
+    assert run("register", *pair, "-o", out)[0] == 0
+    surveys = [Path(path) for path in pair]
+    more: list[object] = []
+    if kind in ("reference", "moving"):
+        named = out / "new_registered.obj"  # a file of our own, but it is read
+        surveys[("reference", "moving").index(kind)] = named
+    elif kind == "texture":
+        named = out / "page.mtl"
+        named.write_text("newmtl a\n")
+        beside = tmp_path / "beside.obj"
+        beside.write_text("mtllib out/page.mtl\n" + surveys[1].read_text())
+        surveys[1] = beside
+        with (out / "manifest.json").open() as file:  # as if it were of ours
+            document = json.load(file)
+        document["files"]["page.mtl"] = {
+            "bytes": 9, "sha256": hashlib.sha256(b"newmtl a\n").hexdigest(),
+        }  # fmt: skip
+        (out / "manifest.json").write_text(json.dumps(document))
+    elif kind == "side file":
+        named = out / "settings.toml"
+        (tmp_path / "in" / "new_offset.xyz").symlink_to(named)
+        surveys[1] = out / "new_registered.obj"
+    elif kind == "notes":
+        named = out / "notes.txt"
+        named.write_text("mine")
+    else:
+        named = out / {"ties": "ties.csv", "mask": "mask.geojson", "config": "settings.toml"}[kind]
+        if kind != "config":
+            named.write_text("mine")
+        more = [f"--{kind}", f"moving:not:{named}" if kind == "mask" else named]
+    before = {p: p.read_bytes() for p in out.rglob("*") if p.is_file()}
+    code, _, error = run("register", *surveys, "-o", out, "--overwrite", *more)
+    assert code == 2, error
+    assert "Nothing is deleted" in error
+    assert named.name in error or kind == "side file"
+    assert {p: p.read_bytes() for p in out.rglob("*") if p.is_file()} == before
+
+
+def test_a_rejected_result_is_replaced_without_being_asked_for(
+    tmp_path: Path, pair: tuple[str, str], run: Run, verdict: Any
+) -> None:
+    out = tmp_path / "out"
+    verdict("rejected")
+    assert run("register", *pair, "-o", out)[0] == 4
+    (out / "notes.txt").write_text("mine")
+    verdict("accepted")
+    code, _, error = run("register", *pair, "-o", out)
+    assert (code, "notes.txt" in error) == (2, True)
+    (out / "notes.txt").unlink()
+    assert run("register", *pair, "-o", out)[0] == 0
+    assert run("register", *pair, "-o", out)[0] == 2
+
+
+@pytest.mark.parametrize("command", ["rasterize", "apply", "selftest", "synth"])
+def test_no_command_removes_what_it_did_not_write(
+    tmp_path: Path, pair: tuple[str, str], run: Run, verdict: Any, command: str
+) -> None:
+    verdict("accepted")
+    out, other = tmp_path / "out", tmp_path / "result"
+    marker = {"rasterize": "dem.tif", "apply": "moved.json", "selftest": "selftest.json"}
+    arguments: dict[str, list[object]] = {
+        "rasterize": [pair[0], "--dem-cell", 1],
+        "apply": [other, pair[1]],
+        "selftest": [*pair, "--shifts", 1],
+        "synth": ["flat_sand", "--size", 2, "--format", "ply-cloud"],
+    }
+    if command == "apply":
+        assert run("register", *pair, "-o", other)[0] == 0
+    out.mkdir()
+    (out / marker.get(command, "truth.json")).write_text("{}")
+    (out / "mine.txt").write_text("mine")
+    code, _, error = run(command, *arguments[command], "-o", out, "--overwrite")
+    assert (code, "mine.txt" in error) == (2, True), error
+    assert (out / "mine.txt").read_text() == "mine"
+    if command in ("selftest", "synth"):
+        return  # the work itself has its own tests
+    (out / "mine.txt").unlink()
+    (out / marker[command]).unlink()
+    for _ in range(2):
+        code, _, error = run(command, *arguments[command], "-o", out, "--overwrite")
+        assert code == 0, error
+    assert json.loads((out / "manifest.json").read_text())["command"] == command
 
 
 def test_input_that_changes_meanwhile_gives_no_output(
@@ -1021,6 +1115,7 @@ def test_surveys_of_different_places_are_rejected(tmp_path: Path, run: Run) -> N
         "settings.toml",
         "log.txt",
         "figures",
+        "manifest.json",
         "report.html",
     }
     assert {path.stem for path in (tmp_path / "o" / "figures").iterdir()} == {"extents"}

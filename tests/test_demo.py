@@ -29,7 +29,7 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]
     out = tmp_path_factory.mktemp("demo") / "out"
     out.mkdir()
     (out / "registration.json").write_text("{}")
-    (out / "stale").write_text("of the former run")
+    (out / "validation.html").write_text("of the former run")
     command = [sys.executable, "-m", "meshreg", "demo", "--overwrite", "-o", str(out), "--json"]
     done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=False)
     assert done.returncode == 0, done.stderr + done.stdout
@@ -67,7 +67,7 @@ def test_surveys_are_meshes_of_several_pages_and_can_be_read(
     assert {path.name for path in out.parent.iterdir()} == {"out"}
     names = {path.name for path in out.iterdir()}
     assert names >= {"registration.json", "surveys", "figures", "moving_registered.obj", "log.txt"}
-    assert "stale" not in names
+    assert "validation.html" not in names
     assert (out / "figures" / "orthos.png").is_file()
     assert str(out.parent / ".out") not in (out / "log.txt").read_text()  # no passing names
     for name in ("reference", "moving"):

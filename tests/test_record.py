@@ -320,7 +320,7 @@ def test_folder_holds_what_the_verdict_allows(tmp_path: Path, verdict: str) -> N
     out = tmp_path / "out"
     write_registration(registration, out, reference=reference, moving=moving)
     names = {path.name for path in out.iterdir()}
-    record = {"registration.json", "settings.toml"}
+    record = {"registration.json", "settings.toml", "manifest.json"}
     maps = {f"{which}_{what}.tif" for which in ("reference", "moving") for what in ("dem", "ortho")}
     transforms = {"transform.txt", "transform_inverse.txt", "transform_global.txt"}
     assert record <= names

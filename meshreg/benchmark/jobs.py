@@ -19,6 +19,7 @@ from meshreg.io.atomic import atomic_file
 from meshreg.types import Registration, Survey
 
 Record = dict[str, Any]
+WORK = ".work"  # in the folder of a run: what its processes are making
 TRUTH = ("centroid", "offset", "yaw", "overlap", "same_ground", "mirrored", "severity")
 
 
@@ -113,7 +114,7 @@ def _files(job: Job, folder: Path) -> Record:
     from meshreg.io import read_survey
 
     recipe = recipe_of(job)
-    work = folder / "work"
+    work = folder / WORK
     work.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=work) as temporary:
         started = time.perf_counter()

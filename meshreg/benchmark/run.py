@@ -12,17 +12,19 @@ from pathlib import Path
 from typing import Any
 
 from meshreg.benchmark import curves, maps, page, tables
-from meshreg.benchmark.jobs import Record, read_record, run_job
+from meshreg.benchmark.jobs import WORK, Record, place_path, read_record, record_path, run_job
 from meshreg.benchmark.plan import SCHEMA, Job, Options, jobs
 from meshreg.benchmark.summary import summarise
 from meshreg.benchmark.workers import run_all
 from meshreg.errors import UsageError
+from meshreg.io import manifest
 from meshreg.io.atomic import as_output_error, atomic_file
+from meshreg.io.manifest import require_only_ours, require_ours, write_manifest
 
 log = logging.getLogger(__name__)
 Progress = Callable[[str, int, int], None]
 MARKER = "benchmark.json"
-_OURS = ("pairs", "sites", "figures", "work")  # folders that a new run clears away
+PAGES = ("pairs.csv", "summary.json", "index.html")
 
 
 def run_benchmark(
@@ -47,7 +49,7 @@ def run_benchmark(
         Go on with a run that is in the folder: pairs are not run again whose file is there, made
         by the same version with the same recipe, seed and settings.
     overwrite : bool
-        Start afresh in a folder that holds a run.
+        Start afresh in a folder that holds a run, and nothing else.
     progress : callable, optional
         Called with the stage's name, how many jobs are done, and how many there are.
 
@@ -88,7 +90,9 @@ def run_benchmark(
         "cpu_seconds": sum(record["cpu_seconds"] for record in records),
         **summary,
     }
-    _write(summary, rows, folder)
+    written = [MARKER, *_write(summary, rows, folder), *_kept(lots, records)]
+    with as_output_error(folder):
+        write_manifest(folder, "benchmark", [n for n in written if (folder / n).is_file()])
     tell("tables and figures", 1, 1)
     return summary
 
@@ -102,13 +106,16 @@ def _prepare(folder: Path, resume: bool, overwrite: bool) -> None:
             raise UsageError(
                 "holds a benchmark already.", file=folder, remedy="Use --resume or --overwrite."
             )
+        if (folder / WORK).is_dir() and not (folder / WORK).is_symlink():
+            shutil.rmtree(folder / WORK, ignore_errors=True)  # of a run that was killed
         if used and overwrite and not resume:
-            for name in _OURS:
-                if (folder / name).is_symlink():
-                    raise UsageError("is a link.", file=folder / name, remedy="Remove it.")
-                shutil.rmtree(folder / name, ignore_errors=True)
+            for name in require_only_ours(folder, (MARKER,)):
+                (folder / name).unlink()
+        elif used:
+            require_ours(folder, PAGES)
         folder.mkdir(parents=True, exist_ok=True)
-        shutil.rmtree(folder / "work", ignore_errors=True)  # of a run that was killed
+        # written anew at the end; the files of a run that is stopped are known by their names
+        (folder / manifest.NAME).unlink(missing_ok=True)
 
 
 def _run(
@@ -130,7 +137,20 @@ def _run(
     return [record for record in records if record is not None]
 
 
-def _write(summary: Mapping[str, Any], rows: Sequence[tables.Row], folder: Path) -> None:
+def _kept(lots: Sequence[Sequence[Job]], records: Sequence[Record]) -> list[str]:
+    """Name the files of single jobs, in the folder of a run."""
+    here = Path()
+    names = [f"figures/{name}" for record in records for name in record.get("figures", ())]
+    for job in (job for lot in lots for job in lot):
+        names.append(record_path(job, here).as_posix())
+        if job.kind == "site":
+            names.append(place_path(job.index, here).as_posix())
+    return names
+
+
+def _write(summary: Mapping[str, Any], rows: Sequence[tables.Row], folder: Path) -> list[str]:
+    """Write tables, figures and the page; return their names."""
+    names = [*PAGES]
     with as_output_error(folder):
         tables.write_csv(rows, folder / "pairs.csv")
         with atomic_file(folder / "summary.json") as path:
@@ -143,5 +163,7 @@ def _write(summary: Mapping[str, Any], rows: Sequence[tables.Row], folder: Path)
                 target.unlink(missing_ok=True)
             else:
                 maps.save(figure, target)
+                names.append(f"figures/{name}.png")
         with atomic_file(folder / "index.html") as path:
             path.write_text(page.write_page(summary, folder), encoding="utf-8")
+    return names

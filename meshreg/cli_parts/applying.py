@@ -10,7 +10,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from rich.markup import escape
 
-from meshreg.cli_parts.common import SurveyRequest, new_folder, read, require_disk
+from meshreg.cli_parts.common import (
+    NewFolder,
+    SurveyRequest,
+    named_files,
+    new_folder,
+    read,
+    require_disk,
+)
 from meshreg.cli_parts.console import Progress, Voice, logging_to
 from meshreg.cli_parts.guard import Unfinished
 from meshreg.errors import UsageError
@@ -36,6 +43,7 @@ def apply(request: ApplyRequest, voice: Voice, unfinished: Unfinished) -> dict[s
     """Move a further file of the moving survey by a registration that was found."""
     from meshreg.io import rewrite_survey, unchanged
     from meshreg.io.atomic import as_output_error
+    from meshreg.io.manifest import require_apart, survey_files
     from meshreg.io.record import read_registration, reference_stand_in, to_json
 
     registration = read_registration(request.registration)
@@ -44,13 +52,16 @@ def apply(request: ApplyRequest, voice: Voice, unfinished: Unfinished) -> dict[s
             f"This registration was rejected ({registration.reason}); it moves nothing.",
             file=request.registration,
         )
+    inputs = named_files((request.survey,), others=(request.registration,))
+    new = NewFolder(request.out, request.overwrite, "apply", MOVED, inputs)
     with (
-        new_folder(request.out, request.overwrite, unfinished, MOVED) as folder,
+        new_folder(new, unfinished) as folder,
         logging_to(voice),
         Progress(voice) as progress,
     ):
         progress("read", 0.0)
         survey, notes = _read_like(request.survey, registration)
+        require_apart(request.out, survey_files(survey))
         if registration.verdict == "review":
             notes.append("The registration is in review: this is its best hypothesis only.")
         require_disk(folder, survey)

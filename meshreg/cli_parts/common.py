@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import glob
 import importlib
 import logging
 import os
@@ -52,18 +53,79 @@ def import_early(*names: str) -> None:
     threading.Thread(target=work, daemon=True).start()
 
 
+@dataclass(frozen=True)
+class NewFolder:
+    """A folder to be made for a command's result.
+
+    Attributes
+    ----------
+    out : Path
+    overwrite : bool
+    command : str
+        For the manifest.
+    marker : str
+        The file by which a former result of the command is known.
+    inputs : tuple of path
+        Files and folders that the command line names; none of them may lie in `out`.
+    """
+
+    out: Path
+    overwrite: bool
+    command: str
+    marker: str
+    inputs: tuple[str | Path, ...] = ()
+
+
 @contextmanager
-def new_folder(out: Path, overwrite: bool, unfinished: Unfinished, marker: str) -> Iterator[Path]:
-    """Give a temporary folder that becomes `out` when the block ends well.
+def new_folder(new: NewFolder, unfinished: Unfinished) -> Iterator[Path]:
+    """Give a temporary folder that becomes `new.out` when the block ends well.
 
     That the folder can be written and the disk is not full is found out here, before the work.
     """
     from meshreg.io.atomic import as_output_error, atomic_folder
+    from meshreg.io.manifest import require_apart
 
-    with as_output_error(out):
-        out.absolute().parent.mkdir(parents=True, exist_ok=True)
-    with atomic_folder(out, overwrite, (marker,)) as folder, unfinished.holding(folder):
+    with as_output_error(new.out):
+        require_apart(new.out, new.inputs)
+        new.out.absolute().parent.mkdir(parents=True, exist_ok=True)
+    with (
+        atomic_folder(new.out, new.overwrite, (new.marker,), new.command) as folder,
+        unfinished.holding(folder),
+    ):
         yield folder
+
+
+def named_files(
+    surveys: Sequence[SurveyRequest],
+    masks: Sequence[str] = (),
+    tables: str | None = None,
+    others: Sequence[Path | None] = (),
+) -> tuple[Path, ...]:
+    """Return the files and folders that a command line names; patterns are looked up.
+
+    Parameters
+    ----------
+    surveys : sequence of SurveyRequest
+    masks : sequence of str
+        As in `read_masks`.
+    tables : str, optional
+        Tie points: one file, or two with a comma between.
+    others : sequence of path or None
+    """
+    found = [path for path in others if path is not None]
+    found += [r.options.positions for r in surveys if r.options.positions is not None]
+    from meshreg.io.finding import split_pair
+
+    for text in (*(r.path for r in surveys), *(_mask(m)[2] for m in masks), tables):
+        if text is None:
+            continue
+        if os.path.lexists(text):
+            found.append(Path(text))
+        elif here := [Path(name) for name in glob.glob(text, recursive=True)]:
+            found += here
+        else:
+            found += split_pair(text)
+    return tuple(found)
 
 
 def require_disk(folder: Path, survey: Survey | None) -> None:
@@ -104,13 +166,7 @@ def read_masks(said: Sequence[str], surveys: Mapping[str, Survey]) -> dict[str, 
 
     found: dict[str, list[Callable[[Any], Any]]] = {"reference": [], "moving": []}
     for text in said:
-        which, name, invert = "reference", text, False
-        while (parts := name.partition(":"))[0] in ("reference", "moving", "not") and parts[2]:
-            if parts[0] == "not":
-                invert = not invert
-            else:
-                which = parts[0]
-            name = parts[2]
+        which, invert, name = _mask(text)
         if which not in surveys:
             raise UsageError(f"--mask {text!r}: there is no {which} survey here.")
         here, common = surveys[which], surveys["reference"].crs
@@ -120,6 +176,18 @@ def read_masks(said: Sequence[str], surveys: Mapping[str, Survey]) -> dict[str, 
         found[which].append(mask)
         LOG.info("mask of the %s: %s%s", which, "all but " if invert else "", name)
     return {which: _every(masks) for which, masks in found.items()}
+
+
+def _mask(text: str) -> tuple[str, bool, str]:
+    """Split `[reference:|moving:][not:]FILE` into survey, whether it is inverted, and file."""
+    which, name, invert = "reference", text, False
+    while (parts := name.partition(":"))[0] in ("reference", "moving", "not") and parts[2]:
+        if parts[0] == "not":
+            invert = not invert
+        else:
+            which = parts[0]
+        name = parts[2]
+    return which, invert, name
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ import numpy as np
 from rich.markup import escape
 from rich.table import Table
 
-from meshreg.cli_parts.common import SurveyRequest, new_folder
+from meshreg.cli_parts.common import NewFolder, SurveyRequest, new_folder
 from meshreg.cli_parts.console import Progress, Voice, logging_to
 from meshreg.cli_parts.guard import Unfinished
 from meshreg.cli_parts.registering import RegisterRequest, register, register_into
@@ -72,7 +72,7 @@ def made(out: Path, overwrite: bool, voice: Voice, unfinished: Unfinished) -> De
     from meshreg.io.options import ReadOptions
 
     with (
-        new_folder(out, overwrite, unfinished, "registration.json") as folder,
+        new_folder(NewFolder(out, overwrite, "demo", "registration.json"), unfinished) as folder,
         logging_to(voice, folder / "log.txt"),
         Progress(voice) as progress,
     ):

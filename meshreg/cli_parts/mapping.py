@@ -10,7 +10,9 @@ from rich.markup import escape
 
 from meshreg.cli_parts.common import (
     LOG,
+    NewFolder,
     SurveyRequest,
+    named_files,
     new_folder,
     read,
     read_masks,
@@ -30,21 +32,26 @@ class RasterizeRequest:
     masks: tuple[str, ...] = ()
     settings: Settings = field(default_factory=Settings)
     overwrite: bool = False
+    config: Path | None = None
 
 
 def rasterize(request: RasterizeRequest, voice: Voice, unfinished: Unfinished) -> dict[str, Any]:
     """Write dem.tif and ortho.tif of one survey; say what they are."""
+    from meshreg.io.manifest import require_apart, survey_files
     from meshreg.io.maps import write_raster
     from meshreg.raster import rasterize as make_raster
     from meshreg.raster.grid import choose_cells, survey_grid
 
+    inputs = named_files((request.survey,), request.masks, others=(request.config,))
+    new = NewFolder(request.out, request.overwrite, "rasterize", "dem.tif", inputs)
     with (
-        new_folder(request.out, request.overwrite, unfinished, "dem.tif") as folder,
+        new_folder(new, unfinished) as folder,
         logging_to(voice, folder / "log.txt"),
         Progress(voice) as progress,
     ):
         progress("read", 0.0)
         survey = read(request.survey)
+        require_apart(request.out, survey_files(survey))
         require_disk(folder, None)
         mask = read_masks(request.masks, {"reference": survey})["reference"]
         options = request.settings.raster

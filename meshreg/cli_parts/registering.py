@@ -13,8 +13,10 @@ from typing import TYPE_CHECKING
 from meshreg.cli_parts import pairing
 from meshreg.cli_parts.common import (
     LOG,
+    NewFolder,
     SurveyRequest,
     import_early,
+    named_files,
     new_folder,
     read,
     read_masks,
@@ -50,12 +52,19 @@ class RegisterRequest:
     settings: Settings = field(default_factory=Settings)
     overwrite: bool = False
     ties: str | None = None
+    config: Path | None = None  # the file that the settings came from
+
+
+def _new(request: RegisterRequest) -> NewFolder:
+    surveys = (request.reference, request.moving)
+    inputs = named_files(surveys, request.masks, request.ties, (request.config,))
+    return NewFolder(request.out, request.overwrite, "register", "registration.json", inputs)
 
 
 def register(request: RegisterRequest, voice: Voice, unfinished: Unfinished) -> Registration:
     """Run the main job: read, register, write OUT whole."""
     with (
-        new_folder(request.out, request.overwrite, unfinished, "registration.json") as folder,
+        new_folder(_new(request), unfinished) as folder,
         logging_to(voice, folder / "log.txt"),
         Progress(voice) as progress,
     ):
@@ -66,6 +75,7 @@ def register_into(folder: Path, request: RegisterRequest, progress: Progress) ->
     """Read, register, write everything into a folder that is there already."""
     from meshreg.io import require_writable, rewrite_survey, unchanged
     from meshreg.io.frames import common_crs
+    from meshreg.io.manifest import require_apart, survey_files
     from meshreg.types import Maps
 
     _log_start(request)
@@ -77,6 +87,7 @@ def register_into(folder: Path, request: RegisterRequest, progress: Progress) ->
         import_early(*_NEEDED)
         clock = time.perf_counter()
         reference, moving, notes = _read_both(request, progress)
+        require_apart(request.out, survey_files(reference, moving))
         masks = read_masks(request.masks, {"reference": reference, "moving": moving})
         moving, crs_notes = common_crs(reference, moving)
         notes += crs_notes

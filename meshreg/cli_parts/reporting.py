@@ -14,6 +14,8 @@ from meshreg.errors import InputError, MeshregError
 if TYPE_CHECKING:
     from meshreg.types import Registration
 
+PAGE = "report.html"
+
 
 def add_report(registration: Registration, folder: Path) -> None:
     """Save the evidence and make the page; one that fails is no reason to lose a result.
@@ -49,19 +51,24 @@ def write_report(folder: Path) -> Path:
     ------
     InputError
         If there is no result in the folder, or its record or evidence is damaged.
+    UsageError
+        If the page that is there is not as meshreg wrote it.
     OutputError
         If the page cannot be written.
     """
     from meshreg.io.atomic import atomic_file
     from meshreg.io.evidence import read_evidence
+    from meshreg.io.manifest import add_to_manifest, require_ours
     from meshreg.io.record import read_registration
     from meshreg.report import gather, report_page
 
     folder = _result_folder(folder)
+    require_ours(folder, (PAGE,))
     result = gather(read_registration(folder), read_evidence(folder), folder)
-    path = folder / "report.html"
+    path = folder / PAGE
     with atomic_file(path) as partial:
         partial.write_text(report_page(result), encoding="utf-8")
+    add_to_manifest(folder, (PAGE,))
     return path
 
 

@@ -13,7 +13,15 @@ from rich.markup import escape
 from rich.table import Table
 
 from meshreg.cli_parts import pairing
-from meshreg.cli_parts.common import LOG, SurveyRequest, new_folder, read, read_masks
+from meshreg.cli_parts.common import (
+    LOG,
+    NewFolder,
+    SurveyRequest,
+    named_files,
+    new_folder,
+    read,
+    read_masks,
+)
 from meshreg.cli_parts.console import Progress, Voice, logging_to
 from meshreg.cli_parts.guard import Unfinished
 from meshreg.settings import Settings
@@ -32,6 +40,7 @@ class SelftestRequest:
     settings: Settings = field(default_factory=Settings)
     count: int = 8
     overwrite: bool = False
+    config: Path | None = None
 
 
 def selftest(request: SelftestRequest, voice: Voice, unfinished: Unfinished) -> dict[str, Any]:
@@ -54,18 +63,24 @@ def _folder(request: SelftestRequest, unfinished: Unfinished) -> Iterator[Path |
     if request.out is None:
         yield None
         return
-    with new_folder(request.out, request.overwrite, unfinished, FILE) as folder:
+    surveys = (request.reference, request.moving)
+    inputs = named_files(surveys, request.masks, others=(request.config,))
+    new = NewFolder(request.out, request.overwrite, "selftest", FILE, inputs)
+    with new_folder(new, unfinished) as folder:
         yield folder
 
 
 def _tested(request: SelftestRequest, progress: Progress) -> dict[str, Any]:
     from meshreg.io.frames import common_crs
+    from meshreg.io.manifest import require_apart, survey_files
     from meshreg.selftest import self_test
 
     progress("read", 0.0)
     reference = read(request.reference, "reference")
     progress("read", 0.5)
     moving = read(request.moving, "moving")
+    if request.out is not None:
+        require_apart(request.out, survey_files(reference, moving))
     requests = (request.reference, request.moving)
     pairing.require_scale(requests, (reference, moving))
     radius = request.settings.search.radius or 10.0

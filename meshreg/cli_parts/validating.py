@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from meshreg.types import Float64, OffsetEstimate, Registration, Survey, Transform
 
 _DASH = "–"
+PAGES = ("validation.html", "validation.json")
 
 
 @dataclass(frozen=True)
@@ -42,6 +43,7 @@ class ValidateRequest:
 def validate(request: ValidateRequest) -> dict[str, Any]:
     """Compare, write validation.json, .html and figures into OUT, say so in its report.html."""
     from meshreg.io.document import read_registration, to_json
+    from meshreg.io.manifest import add_to_manifest, require_ours
     from meshreg.ties.figure import draw_validation
     from meshreg.ties.page import sentence, validation_page
     from meshreg.ties.placing import read_placing
@@ -53,6 +55,7 @@ def validate(request: ValidateRequest) -> dict[str, Any]:
         raise UsageError(
             "is no folder.", file=request.out, remedy="Give the one that `meshreg register` wrote."
         )
+    require_ours(request.out, (*PAGES, "report.html"))
     registration = read_registration(request.out)
     placing = None if registration.transform is None else read_placing(request.out)
     ties, about = read_pairs(request, registration, placing)
@@ -72,10 +75,13 @@ def validate(request: ValidateRequest) -> dict[str, Any]:
         str(getattr(registration, which).get("name") or which) for which in ("reference", "moving")
     )
     page = validation_page(document, drawn, names)  # type: ignore[arg-type]
-    for name, picture in drawn.items():
-        _write(request.out / "figures" / f"{name}.png", picture)
+    pictures = {f"figures/{name}.png": picture for name, picture in drawn.items()}
+    require_ours(request.out, tuple(pictures))
+    for name, picture in pictures.items():
+        _write(request.out / name, picture)
     _write(request.out / "validation.html", page.encode("utf-8"))
     _write(request.out / "validation.json", to_json(document).encode("utf-8"))
+    add_to_manifest(request.out, (*pictures, *PAGES))
     remake_report(request.out)
     return document
 

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import hashlib
 import os
 import secrets
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from meshreg.errors import OutputError, UsageError
+from meshreg.errors import InputError, OutputError, UsageError
+
+if TYPE_CHECKING:
+    from meshreg.io.manifest import Seen
 
 
 @contextlib.contextmanager
@@ -114,7 +119,10 @@ def _partial_name(path: Path) -> tuple[str, str]:
 
 @contextlib.contextmanager
 def atomic_folder(
-    path: Path, overwrite: bool = False, markers: tuple[str, ...] = ("registration.json",)
+    path: Path,
+    overwrite: bool = False,
+    markers: tuple[str, ...] = ("registration.json",),
+    command: str = "",
 ) -> Iterator[Path]:
     """Give a temporary folder beside `path`; it becomes `path` when the block ends well.
 
@@ -126,10 +134,13 @@ def atomic_folder(
     path : Path
         The folder to make.
     overwrite : bool
-        Replace a folder that is there already. It must be empty or hold one of `markers`, so
-        that only a former result is ever deleted.
+        Replace a folder that is there already. It must be empty, or hold one of `markers` and
+        nothing but what meshreg wrote (`meshreg.io.manifest`): no other file is ever removed.
+        A registration that was rejected may be replaced in any case.
     markers : tuple of str
         Names of files by which a former result is known.
+    command : str
+        What makes the folder; its files are entered in a manifest. "" for a folder within one.
 
     Raises
     ------
@@ -138,40 +149,69 @@ def atomic_folder(
     OutputError
         Another run is writing there, or any OSError.
     """
+    from meshreg.io.manifest import discard, write_manifest
+
     path = Path(os.path.abspath(path))
     with as_output_error(path):
-        _require_replaceable(path, overwrite, markers)
+        seen = _require_replaceable(path, overwrite, markers)
     prefix = f".{short_name(path.name)}.{hashlib.sha256(os.fsencode(path.name)).hexdigest()[:8]}"
     with as_output_error(path), _locked(path, path.with_name(prefix + ".lock")):
         _clear_leftovers(path, prefix)
         temporary = path.with_name(prefix + ".tmp")
         temporary.mkdir()
+        replaced = None
         try:
             yield temporary
+            if command:
+                write_manifest(temporary, command)
             for folder, _, names in os.walk(temporary):
                 for name in names:
                     _sync(Path(folder, name))
-            _require_replaceable(path, overwrite, markers)
-            _swap_in(temporary, path, path.with_name(prefix + ".old"))
+            _require_replaceable(path, overwrite, markers, seen)
+            replaced = _swap_in(temporary, path, path.with_name(prefix + ".old"))
         finally:
-            shutil.rmtree(temporary, ignore_errors=True)
+            if replaced is None:
+                shutil.rmtree(temporary, ignore_errors=True)
+        if replaced.exists():
+            discard(replaced, path.with_name(path.name + ".kept"))
 
 
-def _require_replaceable(path: Path, overwrite: bool, markers: tuple[str, ...]) -> None:
+def _require_replaceable(
+    path: Path, overwrite: bool, markers: tuple[str, ...], seen: Seen | None = None
+) -> Seen | None:
+    """Refuse a path that may not be replaced; return what is there, for a second look."""
+    from meshreg.io.manifest import require_only_ours
+
     if not os.path.lexists(path):
-        return
-    if not overwrite:
+        return seen
+    if not overwrite and not _is_rejected(path, markers):
         raise UsageError("exists already.", file=path, remedy="Choose another, or --overwrite.")
     if path.is_symlink() or not path.is_dir():
         raise UsageError("exists and is not a folder.", file=path, remedy="Choose another.")
-    names = os.listdir(path)
-    if names and not any(marker in names for marker in markers):
+    why = ""
+    if os.path.ismount(path):
+        why = "is a mount point"
+    elif Path.cwd().is_relative_to(path.resolve()):
+        why = "is the current folder, or holds it"
+    elif Path(os.path.expanduser("~")).resolve().is_relative_to(path.resolve()):
+        why = "is your home, or holds it"
+    if why:
         raise UsageError(
-            f"holds {len(names)} files and folders, but no {' or '.join(markers)}: it is no former "
-            "result and will not be deleted.",
-            file=path,
-            remedy="Choose another folder.",
+            f"{why}; it cannot be replaced.", file=path, remedy="Choose a folder in it."
         )
+    return require_only_ours(path, markers, seen)
+
+
+def _is_rejected(path: Path, markers: tuple[str, ...]) -> bool:
+    """Whether a folder holds a registration that was rejected, which nobody wants to keep."""
+    if "registration.json" not in markers or not (path / "registration.json").is_file():
+        return False
+    from meshreg.io.document import read_registration
+
+    try:
+        return read_registration(path).verdict == "rejected"
+    except InputError:
+        return False
 
 
 @contextlib.contextmanager
@@ -210,24 +250,58 @@ def _locked(path: Path, lock: Path) -> Iterator[None]:
 
 def _clear_leftovers(path: Path, prefix: str) -> None:
     """Undo what a killed run left: drop its half result, put back the one it was replacing."""
-    old = path.with_name(prefix + ".old")
+    from meshreg.io.manifest import NAME, discard
+
+    old, temporary = path.with_name(prefix + ".old"), path.with_name(prefix + ".tmp")
     if old.exists() and not path.exists():
         os.replace(old, path)
-    for leftover in (old, path.with_name(prefix + ".tmp")):
-        if leftover.exists():
-            shutil.rmtree(leftover)
+    kept = path.with_name(path.name + ".kept")
+    if old.exists():
+        discard(old, kept)
+    if (temporary / NAME).exists():  # whole: the former result, if the two changed places
+        discard(temporary, kept)
+    if temporary.exists():
+        shutil.rmtree(temporary)
 
 
-def _swap_in(temporary: Path, path: Path, old: Path) -> None:
-    """Rename `temporary` to `path`; a folder that is there is put back if that fails."""
-    if path.exists():
+def _swap_in(temporary: Path, path: Path, old: Path) -> Path:
+    """Rename `temporary` to `path`; return where what was there is now, if anything was.
+
+    Where the file system can, the two change places in one step, so that `path` is never missing;
+    elsewhere a folder that is there is put back if the second rename fails.
+    """
+    if not path.exists():
+        os.replace(temporary, path)
+        replaced = temporary
+    elif _exchange(temporary, path):
+        replaced = temporary
+    else:
         os.replace(path, old)
         try:
             os.replace(temporary, path)
         except BaseException:
             os.replace(old, path)
             raise
-        shutil.rmtree(old, ignore_errors=True)
-    else:
-        os.replace(temporary, path)
+        replaced = old
     _sync_folder(path.parent)
+    return replaced
+
+
+def _exchange(one: Path, other: Path) -> bool:
+    """Let two paths change places at once; False where the system or the file system cannot.
+
+    renameat2(2) with RENAME_EXCHANGE, of Linux 3.15 and glibc 2.28.
+    """
+    import ctypes
+
+    try:
+        call = ctypes.CDLL(None, use_errno=True).renameat2
+    except (AttributeError, OSError):
+        return False
+    here, exchange = -100, 2  # AT_FDCWD, RENAME_EXCHANGE
+    if call(here, os.fsencode(one), here, os.fsencode(other), exchange) == 0:
+        return True
+    number = ctypes.get_errno()
+    if number in (errno.ENOSYS, errno.EINVAL, errno.ENOTSUP, errno.EPERM):
+        return False
+    raise OSError(number, os.strerror(number), str(other))

@@ -39,7 +39,7 @@ def write_registration(
     ----------
     registration : Registration
     folder : path
-        Must not exist, unless `overwrite` and it holds a former result.
+        Must not exist, unless `overwrite` and it holds a former result and nothing else.
     reference, moving : Survey, optional
         As read from their files. Without them there are no transforms between file coordinates,
         and no registered survey.
@@ -58,12 +58,14 @@ def write_registration(
         If a file could not be written or did not read back as it should.
     """
     from meshreg.io.atomic import atomic_folder
+    from meshreg.io.manifest import NAME, require_apart, survey_files
 
     folder = Path(folder)
-    with atomic_folder(folder, overwrite) as partial:
+    require_apart(folder, survey_files(*(s for s in (reference, moving) if s is not None)))
+    with atomic_folder(folder, overwrite, command="register") as partial:
         files = write_record_files(registration, partial, reference=reference, moving=moving)
         names = [path.relative_to(partial) for path in files]
-    return tuple(folder / name for name in names)
+    return (*(folder / name for name in names), folder / NAME)
 
 
 def write_record_files(

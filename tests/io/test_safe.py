@@ -441,9 +441,9 @@ def test_only_a_former_result_is_overwritten(tmp_path):
     assert (path / "thesis.tex").read_text() == "years of work"
     with pytest.raises(UsageError, match="not a folder"):
         enter(atomic_folder(path / "thesis.tex", overwrite=True))
-    with atomic_folder(path, overwrite=True, markers=("thesis.tex",)) as temporary:
-        (temporary / "dem.tif").write_text("")
-    assert names(path) == ["dem.tif"]
+    with pytest.raises(UsageError, match=r"did not write, .* thesis\.tex\. Nothing is deleted"):
+        enter(atomic_folder(path, overwrite=True, markers=("thesis.tex",)))
+    assert names(path) == ["thesis.tex"]
     with atomic_folder(tmp_path / "empty", overwrite=True):
         pass
 
