@@ -18,23 +18,27 @@ import numpy as np
 from meshreg.errors import InputError, OutputError, UsageError
 from meshreg.io import e57_pages, e57_xml
 from meshreg.io.assemble import Found, placed_survey
+from meshreg.io.classes import RECLASS, ground_classes
 from meshreg.io.crs import crs_text
+from meshreg.io.directions import bend_note, find_directions
 from meshreg.io.e57_scans import (
     CARTESIAN,
     CHUNK,
     COLORS,
+    NORMALS,
     add_scan,
     color_range,
     created,
     library,
     opened,
     pieces,
+    rotation_matrix,
     writer,
 )
 from meshreg.io.e57_xml import Layout
 from meshreg.io.frames import Mover, place
 from meshreg.io.options import ReadOptions
-from meshreg.io.rewriting import require_unchanged
+from meshreg.io.rewriting import require_unchanged, warn
 from meshreg.io.safe import atomic_file, open_regular
 from meshreg.types import Float64, PointCloud, SourceFile, Survey, UInt8
 
@@ -70,6 +74,7 @@ def read(path: Path, options: ReadOptions) -> Survey:
     layout = e57_xml.read_layout(path)
     notes: list[str] = []
     points, colors = _read_scans(path, layout, options.geometry_only, notes)
+    notes += _direction_notes(layout)
     crs = _crs(layout, notes)
     for note in notes:
         log.warning("%s: %s", path.name, note)
@@ -93,13 +98,15 @@ def _crs(layout: Layout, notes: list[str]) -> str | None:
 def _read_scans(
     path: Path, layout: Layout, geometry_only: bool, notes: list[str]
 ) -> tuple[Float64, UInt8 | None]:
-    points, colors, invalid, empty = [], [], 0, 0
+    points, colors, classes, invalid, empty = [], [], [], 0, 0
     with opened(path) as decoder:
         for number, scan in enumerate(layout.scans):
             found = 0
-            for xyz, rgb, kept, _ in pieces(decoder, number, scan):
+            label = next((name for name in scan.fields if _is_class(name)), None)
+            for xyz, rgb, kept, more in pieces(decoder, number, scan, (label,) if label else ()):
                 points.append(xyz[kept])
                 colors.append(None if rgb is None else rgb[kept])
+                classes.append(more[label][kept] if label else np.zeros(len(points[-1])))
                 found += len(kept)
                 invalid += len(kept) - int(kept.sum())
             if found != scan.count:
@@ -121,14 +128,33 @@ def _read_scans(
     if empty:
         notes.append(f"{empty} of {len(layout.scans)} scans hold no points.")
     with_color = [part for part in colors if part is not None]
-    if len(with_color) == len(colors) and not geometry_only:
-        wide = [scan for scan in layout.scans if color_range(scan)[1] > 255]
-        if wide:
-            notes.append("Colours of more than 8 bits were scaled to 8.")
-        return np.concatenate(points), np.concatenate(with_color)
-    if with_color and not geometry_only:
+    every = len(with_color) == len(colors) and not geometry_only
+    if every and any(color_range(scan)[1] > 255 for scan in layout.scans):
+        notes.append("Colours of more than 8 bits were scaled to 8.")
+    if with_color and not every and not geometry_only:
         notes.append("Colours were left out, because not every scan has them.")
-    return np.concatenate(points), None
+    xyz, rgb = np.concatenate(points), np.concatenate(with_color) if every else None
+    ground = ground_classes(np.concatenate(classes), notes)
+    if ground is None:
+        return xyz, rgb
+    if not ground.any():
+        raise InputError(f"holds no usable point ({' '.join(notes)}).", file=path, remedy=RECLASS)
+    return xyz[ground], None if rgb is None else rgb[ground]
+
+
+def _is_class(name: str) -> bool:
+    """Whether a field is the classification, of whatever extension."""
+    return name.rpartition(":")[2].lower() == "classification"
+
+
+def _direction_notes(layout: Layout) -> tuple[str, ...]:
+    """Return what to say of fields with a direction that a moved copy cannot turn.
+
+    A rigid move turns the scans' own frames, in which the standard's fields and normals are.
+    """
+    names = {name for scan in layout.scans for name in scan.fields}
+    own = [name for name in sorted(names) if not name.startswith(("cartesian", "spherical"))]
+    return find_directions(own).notes
 
 
 def rewrite(source: SourceFile, move: Mover, path: Path) -> tuple[Path, ...]:
@@ -136,7 +162,7 @@ def rewrite(source: SourceFile, move: Mover, path: Path) -> tuple[Path, ...]:
 
     A rigid move composes each scan's and image's pose with it: points, colours, pictures and
     extensions keep their bytes. Any other move writes the points anew, one scan for each, with
-    colour and intensity.
+    colour, intensity and normal.
 
     Parameters
     ----------
@@ -159,9 +185,12 @@ def rewrite(source: SourceFile, move: Mover, path: Path) -> tuple[Path, ...]:
         if _is_rigid(source.path, layout, move):
             _rewrite_poses(source.path, layout, move, temporary)
         else:
+            normal = any(set(NORMALS) <= scan.fields.keys() for scan in layout.scans)
+            if normal and (note := bend_note(find_directions(NORMALS), move)):
+                warn(path, note)
             log.warning(
-                "%s: the move is not rigid; pictures and fields other than colour and intensity "
-                "are left out.",
+                "%s: the move is not rigid; pictures and fields other than colour, intensity and "
+                "normal are left out.",
                 path,
             )
             _rewrite_points(source.path, layout, move, temporary, path)
@@ -227,7 +256,9 @@ def _rewrite_points(path: Path, layout: Layout, move: Mover, target: Path, shown
     libe57 = library(path)
     with opened(path) as old, created(libe57, target, crs, shown) as new:
         for number, scan in enumerate(layout.scans):
-            extra = tuple(name for name in ("intensity",) if name in scan.fields)
+            normal = NORMALS if all(name in scan.fields for name in NORMALS) else ()
+            extra = (*(name for name in ("intensity",) if name in scan.fields), *normal)
+            turn = rotation_matrix(scan.rotation)
             colors = COLORS if all(name in scan.fields for name in COLORS) else ()
             names = [*CARTESIAN, *colors, *extra]
             node = add_scan(libe57, new, f"scan {number + 1}", names)
@@ -237,7 +268,12 @@ def _rewrite_points(path: Path, layout: Layout, move: Mover, target: Path, shown
                     data = dict(zip(CARTESIAN, move.points(piece.xyz[kept]).T, strict=True))
                     if piece.rgb is not None:
                         data.update(zip(COLORS, piece.rgb[kept].T, strict=True))
-                    put(data | {name: value[kept] for name, value in piece.extra.items()})
+                    data |= {name: value[kept] for name, value in piece.extra.items()}
+                    if normal:  # in the scan's own frame, which the new file does not have
+                        local = np.stack([data[name] for name in NORMALS], axis=1)
+                        turned = move.directions(piece.xyz[kept], local @ turn.T)
+                        data.update(zip(NORMALS, turned.T, strict=True))
+                    put(data)
 
 
 def write(survey: Survey, path: Path) -> tuple[Path, ...]:
@@ -271,7 +307,13 @@ def write(survey: Survey, path: Path) -> tuple[Path, ...]:
 
 
 def _check(old_path: Path, new_path: Path, move: Mover, path: Path) -> None:
-    """Read old and new file side by side: the new points must be the moved old ones."""
+    """Read old and new file side by side: the new points must be the moved old ones.
+
+    The poses that the new file states are read by another parser than the one that found where
+    the old ones stood.
+    """
+    if not _poses_agree(e57_xml.read_layout(new_path)):
+        raise OutputError("has other poses when read back.", file=path)
     old, new = (_valid_points(each) for each in (old_path, new_path))
     worst = 0.0
     for before, after in zip_longest(old, new):
@@ -282,6 +324,28 @@ def _check(old_path: Path, new_path: Path, move: Mover, path: Path) -> None:
             worst = max(worst, float(np.abs(move.points(before) - after).max()))
     if not worst < 1e-5:
         raise OutputError(f"is off by {worst:.3g} m when read back.", file=path)
+
+
+def _poses_agree(layout: Layout) -> bool:
+    """Whether ElementTree finds the poses that the layout has."""
+    from xml.etree import ElementTree  # the text has no document type, see `e57_xml`
+
+    root = ElementTree.fromstring(layout.xml)
+    for kind in ("data3D", "images2D"):
+        found = root.findall(f"{{*}}{kind}/{{*}}vectorChild")
+        entries = [entry for entry in layout.entries if entry.kind == kind]
+        if len(found) != len(entries):
+            return False
+        for element, entry in zip(found, entries, strict=True):
+            turn, place = (
+                [float(element.findtext(f"{{*}}pose/{{*}}{part}/{{*}}{k}") or 0) for k in names]
+                for part, names in (("rotation", "wxyz"), ("translation", "xyz"))
+            )
+            size = float(np.linalg.norm(turn))
+            unit = np.array(turn) / size if size else np.array([1.0, 0, 0, 0])
+            if np.abs(unit - entry.rotation).max() > 1e-12 or place != entry.translation.tolist():
+                return False
+    return True
 
 
 def _valid_points(path: Path) -> Iterator[Float64]:

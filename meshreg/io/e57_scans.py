@@ -22,7 +22,9 @@ CHUNK = 1_000_000
 CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
 SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
 COLORS = ("colorRed", "colorGreen", "colorBlue")
-_FIELDS = 8  # asked for at once, at most: coordinates, state, colours, intensity
+NORMALS = ("nor:normalX", "nor:normalY", "nor:normalZ")
+_NORMALS_URI = "http://www.libe57.org/E57_EXT_surface_normals.txt"
+_FIELDS = 12  # asked for at once, at most: coordinates, state, colours, intensity, normal, class
 
 
 class MissingLibraryError(MeshregError):
@@ -170,6 +172,7 @@ def created(libe57: Any, temporary: Path, crs: str | None, path: Path) -> Iterat
     file = libe57.ImageFile(str(temporary), "w")
     try:
         file.extensionsAdd("", libe57.E57_V1_0_URI)
+        file.extensionsAdd("nor", _NORMALS_URI)
         root = file.root()
         root.set("formatName", libe57.StringNode(file, "ASTM E57 3D Imaging Data File"))
         root.set("guid", libe57.StringNode(file, f"{{{uuid.uuid4()}}}"))

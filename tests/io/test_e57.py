@@ -80,6 +80,7 @@ def e57_file(
     xml_first: bool = False,
     header: dict | None = None,
     encoding: str = "utf-8",
+    spaces: str = "",
 ) -> Path:
     """Write an E57 file: each scan has `columns` {name: (kind, values)}, maybe `pose`, `limits`."""
 
@@ -96,7 +97,8 @@ def e57_file(
                 '<codecs type="Vector" allowHeterogeneousChildren="1"/></points></vectorChild>'
             )
         return (
-            f'<?xml version="1.0" encoding="UTF-8"?>{prolog}<e57Root type="Structure" xmlns="{NS}">'
+            f'<?xml version="1.0" encoding="UTF-8"?>{prolog}'
+            f'<e57Root type="Structure" xmlns="{NS}"{spaces}>'
             f'{root}<data3D type="Vector" allowHeterogeneousChildren="1">{text}</data3D>'
             '<images2D type="Vector" allowHeterogeneousChildren="1"/></e57Root>'
         ).encode(encoding)
@@ -523,6 +525,59 @@ def test_intensity_survives_a_stretch(tmp_path, points):
     with e57_scans.opened(out) as decoder:
         pieces = list(e57_scans.pieces(decoder, 0, scan, ("intensity",)))
     np.testing.assert_array_equal(pieces[0].extra["intensity"], bright)
+
+
+NORMALS = ("nor:normalX", "nor:normalY", "nor:normalZ")
+NORMAL_SPACE = ' xmlns:nor="http://www.libe57.org/E57_EXT_surface_normals.txt"'
+
+
+@pytest.mark.parametrize("rigid", [True, False])
+def test_normals_turn_with_their_scan(tmp_path, points, rigid):
+    """A rigid move turns the scan's frame, in which they are; any other one the normals."""
+    normals = points / np.linalg.norm(points, axis=1, keepdims=True)
+    columns = xyz_columns(points)
+    columns |= {name: ("<f8", column) for name, column in zip(NORMALS, normals.T, strict=True)}
+    half = 0.5**0.5
+    scan = {"columns": columns, "pose": pose_xml((half, 0.0, 0.0, half), (100.0, 200.0, -7.0))}
+    path = e57_file(tmp_path / "a.e57", [scan], spaces=NORMAL_SPACE)
+    survey = e57.read(path, ReadOptions())
+    assert survey.notes == ()
+    about = np.array([[0.8, 0, 0.6], [0, 1, 0], [-0.6, 0, 0.8]])
+    move = Transform(about, 1.0 if rigid else 1.02, (1, 2, 3))
+    out = tmp_path / "o.e57"
+    e57.rewrite(survey.source[0], make_mover(survey.source[0], move, Frame()), out)
+    entry = e57_xml.read_layout(out).scans[0]
+    with e57_scans.opened(out) as decoder:
+        (piece,) = e57_scans.pieces(decoder, 0, entry, NORMALS)
+        local = np.stack([piece.extra[name] for name in NORMALS], axis=1)
+    w, x, y, z = entry.rotation
+    frame = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    quarter = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    np.testing.assert_allclose(local @ frame.T, normals @ (about @ quarter).T, atol=1e-12)
+
+
+def test_classes_of_noise_and_water_are_left_out(tmp_path, points):
+    classes = np.full(300, 40, np.uint8)
+    classes[:50], classes[50:60], classes[60:63], classes[70] = 41, 45, 7, 9
+    columns = xyz_columns(points) | rgb_columns(np.full((300, 3), 9, np.uint8))
+    columns |= {"las:Classification": ("u1", classes)}
+    space = ' xmlns:las="http://example.org/las"'
+    survey = e57.read(
+        e57_file(tmp_path / "a.e57", [{"columns": columns}], spaces=space), ReadOptions()
+    )
+    np.testing.assert_allclose(absolute(survey), points[classes == 40], atol=1e-12)
+    assert len(survey.geometry.colors) == 236
+    assert survey.notes[0].startswith("3 points classed as noise")
+    assert survey.notes[1].startswith("61 points classed as water")
+    columns["las:Classification"] = ("u1", np.full(300, 41, np.uint8))
+    with pytest.raises(InputError, match="300 points classed as water"):
+        e57.read(e57_file(tmp_path / "b.e57", [{"columns": columns}], spaces=space), ReadOptions())
 
 
 def test_rewrite_refuses_a_file_that_has_changed(tmp_path, points):
