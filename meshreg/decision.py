@@ -142,13 +142,23 @@ def decide(
     if settings.search.max_yaw > 0 or settings.search.max_scale > 0:
         with clock.stage("vote"):
             turn = vote(pairs, settings.search, radius)
-    if turn is not None and turn.needed and turned is not None:
-        log.info("the tiles vote for a turn: %s", turn)
-        with clock.stage("turn"):
-            again, motion = turned_as_voted(pairs, turn, turned, settings.search, radius)
-        decision = _in_frame(again, settings, radius, clock, manual, turn, (motion, pairs))
-        if decision.judgement.verdict != "rejected":
-            return decision
+    if turn is None or not turn.needed or turned is None:
+        return _in_frame(pairs, settings, radius, clock, manual, turn)
+    log.info("the tiles vote for a turn: %s", turn)
+    delivered = None
+    if not turn.proven:  # what the tiles do not prove the judge may, who is told of all trials
+        delivered = _in_frame(pairs, settings, radius, clock, manual, None)
+        if delivered.judgement.verdict == "accepted":
+            return delivered
+    with clock.stage("turn"):
+        again, motion = turned_as_voted(pairs, turn, turned, settings.search)
+    decision = _in_frame(again, settings, radius, clock, manual, turn, (motion, pairs))
+    if delivered is not None:
+        known = delivered.judgement.verdict != "rejected"
+        better = decision.judgement.false_alarm < delivered.judgement.false_alarm
+        return decision if better or not known else delivered
+    if decision.judgement.verdict != "rejected":
+        return decision
     return _in_frame(pairs, settings, radius, clock, manual, turn)
 
 

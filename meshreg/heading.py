@@ -11,8 +11,9 @@ import numpy as np
 from meshreg.refine import Refined
 from meshreg.settings import SearchSettings
 from meshreg.types import Float64, OffsetAt, SurveyRaster, Transform
-from meshreg.voting import SMALL_YAW, Turn, vote
+from meshreg.voting import SMALL_YAW, Turn, scaled, settled
 
+STRAIGHT = np.deg2rad(0.1)  # the refinement takes what is left
 Pairs = dict[str, tuple[SurveyRaster, SurveyRaster]]
 Turned = Callable[[Turn], tuple[Pairs, Transform]]
 
@@ -30,9 +31,9 @@ def yaw_of(motion: Transform) -> float:
 
 
 def turned_as_voted(
-    pairs: Pairs, turn: Turn, turned: Turned, settings: SearchSettings, radius: float
+    pairs: Pairs, turn: Turn, turned: Turned, settings: SearchSettings
 ) -> tuple[Pairs, Transform]:
-    """Turn the moving survey; the tiles of a survey that was far off are asked for its scale anew.
+    """Turn the moving survey; the tiles of one that was far off are then measured anew.
 
     Parameters
     ----------
@@ -43,17 +44,23 @@ def turned_as_voted(
     turned : callable
         ``turned(turn)`` makes the rasters of the turned survey, and says by which motion.
     settings : SearchSettings
-    radius : float
-        Half width of the search window [m].
     """
     if abs(turn.yaw) <= SMALL_YAW:
         return turned(turn)
     # unturned tiles run off their peaks, which by itself feigns a scale of a per cent
     upright = turned(replace(turn, scale=1.0))
-    again = vote(upright[0], settings, radius)
-    if again is None or again.scale == 1.0:
+    there = partial(_still_off, turn, upright[1])
+    again = scaled(settled(upright[0], turn, there), settings)
+    if abs(again.yaw - turn.yaw) < STRAIGHT and again.scale == 1.0:
         return upright
-    return turned(replace(turn, yaw=turn.yaw + again.yaw, scale=again.scale))
+    return turned(again)
+
+
+def _still_off(turn: Turn, motion: Transform, places: Float64) -> Float64:
+    """Offset (N, 2) [m] that a turn leaves at places (N, 2) of a survey that `motion` moved."""
+    level = np.column_stack([places, np.full(len(places), motion.pivot[2])])
+    delivered = motion.inverse().apply(level)[:, :2]
+    return np.asarray(delivered + turn.offset_at(delivered) - places)
 
 
 def on_heading_and_scale(

@@ -15,11 +15,12 @@ import numpy as np
 from meshreg.offsets import neutral
 from meshreg.offsets.correlate import WORKERS
 from meshreg.offsets.surface import MAD_TO_SIGMA
-from meshreg.raster.grid import coarsened
-from meshreg.types import Bool, Float32, Float64, Grid, SurveyRaster
+from meshreg.raster.grid import cell_offset, coarsened
+from meshreg.types import Bool, Float32, Float64, Grid, OffsetAt, SurveyRaster
 
 TILES = 5  # along the patch
 TILE_CELLS = (16, 24)  # a larger tile's corners run off its peak when it is turned by 8°
+MOST = 120  # tiles of a channel: more of them find no more
 CAP = 6.0  # deviations: one tile cannot decide
 
 
@@ -28,7 +29,8 @@ class TileSurfaces:
     """Correlation surfaces of a channel's tiles, in deviations of each surface.
 
     `surfaces`, `scored` (M, K, K); `centres` (M, 2) absolute east and north [m]. Row 0 is the
-    northernmost offset, +`reach` cells; the column of offset 0 is `reach`.
+    northernmost offset, +`reach` cells; the column of offset 0 is `reach`. Where the offsets count
+    from a guess for each tile, `behind` (M, 2) [m east, north] is what whole cells left of it.
     """
 
     cell: float
@@ -36,6 +38,18 @@ class TileSurfaces:
     surfaces: Float32
     scored: Bool
     centres: Float64
+    behind: Float64
+
+    def only(self, which: Bool) -> TileSurfaces:
+        """Return the tiles that `which` (M,) picks."""
+        surfaces, scored = self.surfaces[which], self.scored[which]
+        return dataclasses.replace(
+            self,
+            surfaces=surfaces,
+            scored=scored,
+            centres=self.centres[which],
+            behind=self.behind[which],
+        )
 
 
 def channel_surfaces(
@@ -62,7 +76,77 @@ def channel_surfaces(
     if not found:
         return None
     surfaces, scored, centres = (np.array(part) for part in zip(*found, strict=True))
-    return TileSurfaces(moving.grid.cell, reach, surfaces, scored, centres)
+    return TileSurfaces(moving.grid.cell, reach, surfaces, scored, centres, np.zeros_like(centres))
+
+
+def surfaces_near(
+    reference: SurveyRaster,
+    moving: SurveyRaster,
+    channel: neutral.Channel,
+    guess: OffsetAt,
+    reach: int,
+) -> TileSurfaces | None:
+    """Correlate each tile with the reference about its own guessed offset, to ±`reach` cells.
+
+    At the rasters' own cell; None where there are no tiles.
+    """
+    from scipy.fft import irfft2, next_fast_len, rfft2
+
+    if min(moving.grid.shape) < TILE_CELLS[1]:
+        return None
+    first, second = neutral.fields(reference, channel), neutral.fields(moving, channel)
+    side, cell = TILE_CELLS[1], moving.grid.cell
+    still, moved = _stacked(first), _stacked(second)
+    fields = len(still) - 2
+    nominal = np.array(cell_offset(reference.grid, moving.grid))
+    size = int(next_fast_len(side + 2 * reach, real=True))
+    found = []
+    for top, left in _some(_corners(second.mask.shape, side), second.mask, side):
+        tile = moved[:, top : top + side, left : left + side]
+        area = float(tile[-2].sum())
+        middle = np.array(moving.grid.east_north(top + 0.5 * (side - 1), left + 0.5 * (side - 1)))
+        there = np.ravel(guess(middle[None]))
+        whole = np.rint(np.array([-there[1], there[0]]) / cell).astype(int)
+        row, col = nominal + whole + [top - reach, left - reach]
+        patch = _patch(still, int(row), int(col), side + 2 * reach)
+        a = rfft2(patch, s=(size, size))
+        b = np.conj(rfft2(tile, s=(size, size)))
+        products = (
+            (a[:fields] * b[:fields]).sum(axis=0),
+            a[-2] * b[-2],
+            a[-1] * b[-2],
+            a[-2] * b[-1],
+        )
+        sums = irfft2(np.stack(products), s=(size, size))[:, : 2 * reach + 1, : 2 * reach + 1]
+        surface, scored = _normalised(sums, np.ones(sums.shape[1:], bool), area)
+        if scored.any():
+            behind = np.array([whole[1], -whole[0]]) * cell - there
+            found.append((surface, scored, middle, behind))
+    if not found:
+        return None
+    return TileSurfaces(cell, reach, *(np.array(part) for part in zip(*found, strict=True)))
+
+
+def _patch(fields: Float32, row: int, col: int, side: int) -> Float32:
+    """(K, side, side) of the fields from a row and column on; 0 outside of them."""
+    patch = np.zeros((len(fields), side, side), np.float32)
+    rows = slice(max(row, 0), max(min(row + side, fields.shape[1]), 0))
+    cols = slice(max(col, 0), max(min(col + side, fields.shape[2]), 0))
+    if rows.stop > rows.start and cols.stop > cols.start:
+        part = fields[:, rows, cols]
+        top, left = rows.start - row, cols.start - col
+        patch[:, top : top + part.shape[1], left : left + part.shape[2]] = part
+    return patch
+
+
+def _some(corners: list[tuple[int, int]], mask: Bool, side: int) -> list[tuple[int, int]]:
+    """Return corners of tiles at least half of which is known: `MOST` at most, evenly spread."""
+    full = [
+        (top, left)
+        for top, left in corners
+        if np.count_nonzero(mask[top : top + side, left : left + side]) >= 0.5 * side**2
+    ]
+    return full[:: max(1, -(-len(full) // MOST))]
 
 
 def _near(raster: SurveyRaster, other: SurveyRaster, half: float) -> SurveyRaster:
@@ -111,11 +195,9 @@ def _correlate(
     nominal = (grids[0].north - grids[1].north) / cell, (grids[1].west - grids[0].west) / cell
     steps = np.arange(-reach, reach + 1)
     found = []
-    for top, left in _corners(second.mask.shape, side):
+    for top, left in _some(_corners(second.mask.shape, side), second.mask, side):
         tile = moved[:, top : top + side, left : left + side]
         area = float(tile[-2].sum())
-        if area < 0.5 * side**2:
-            continue
         small = np.conj(rfft2(tile, s=size, workers=WORKERS))
         products = (
             (spectra[:fields] * small[:fields]).sum(axis=0),
@@ -179,6 +261,7 @@ def joined(first: TileSurfaces, second: TileSurfaces) -> TileSurfaces:
         np.concatenate([first.surfaces, second.surfaces[pick]]),
         np.concatenate([first.scored, second.scored[pick]]),
         np.concatenate([first.centres, second.centres]),
+        np.concatenate([first.behind, second.behind]),
     )
 
 
@@ -194,6 +277,5 @@ def pooled(tiles: TileSurfaces) -> TileSurfaces:
         ]
         surfaces = np.maximum(np.maximum(parts[0], parts[1]), parts[2])
     part = slice(first, first + 4 * half + 1, 2)
-    return TileSurfaces(
-        2 * tiles.cell, half, np.minimum(surfaces, CAP), tiles.scored[:, part, part], tiles.centres
-    )
+    surfaces, scored = np.minimum(surfaces, CAP), tiles.scored[:, part, part]
+    return TileSurfaces(2 * tiles.cell, half, surfaces, scored, tiles.centres, tiles.behind)

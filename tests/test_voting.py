@@ -19,8 +19,9 @@ from meshreg.raster.grid import coarsened
 from meshreg.settings import SearchSettings
 from meshreg.statistics import registration_sigma
 from meshreg.tile_surfaces import channel_surfaces
-from meshreg.types import Transform
+from meshreg.types import Grid, SurveyRaster, Transform
 from meshreg.voting import STANDS_OUT, similarity, vote
+from meshreg.voting_kernels import BIAS, SCORED, strongest
 
 OFFSET = np.array([1.337, -2.412, 0.083])
 SEARCH = SearchSettings()
@@ -272,3 +273,77 @@ def test_coarse_cells_vote_too():
     mixed = {"dem": tuple(coarsened(r, 2) for r in pairs["dem"]), "ortho": pairs["ortho"]}
     turn = vote(mixed, SEARCH, 5.0)
     assert math.degrees(turn.yaw) == pytest.approx(5, abs=0.3)
+
+
+# -- the kernel and its slow twin -----------------------------------------------------------------
+
+
+def test_strongest_sums_are_those_of_a_slow_twin():
+    rng = np.random.default_rng(5)
+    tiles, size, reach, hypotheses = 7, 13, 3, 4
+    values = rng.integers(-BIAS + 1, BIAS, (tiles, size, size))
+    scored = rng.random(values.shape) < 0.7
+    starts = rng.integers(0, size - 2 * reach, (hypotheses, tiles, 2))
+    least = np.array([4, 2, 3])
+    packed = np.where(scored, SCORED + BIAS + values, 0).astype(np.int32)
+    highest, choice = strongest(packed, starts, 3, least, reach)
+    sets = [range(tiles), range(3), range(3, tiles)]
+    for which, row, col in np.ndindex(3, 2 * reach + 1, 2 * reach + 1):
+        sums = []
+        for number in range(hypotheses):
+            cells = [
+                (t, starts[number, t, 0] + row, starts[number, t, 1] + col) for t in sets[which]
+            ]
+            known = [values[c] for c in cells if scored[c]]
+            enough = len(known) >= least[which]
+            sums.append(sum(known) / math.sqrt(len(known)) if enough else -math.inf)
+        assert highest[which, row, col] == pytest.approx(max(sums), rel=1e-6)
+        if math.isfinite(max(sums)):
+            assert sums[choice[which, row, col]] == pytest.approx(max(sums), rel=1e-6)
+
+
+# -- a long, narrow plot whose detail is a cell or two across -----------------------------------
+
+
+def strip(yaw_deg, scale):
+    """A beach of 570 x 60 cells on a slant, with relief of two to four cells."""
+    made = []
+    for angle, factor, seed in ((0.0, 1.0, 1), (yaw_deg, scale, 2)):
+        rng = np.random.default_rng(77)
+        count = 9000
+        east, north = rng.uniform(-290, 290, count), rng.uniform(-40, 40, count)
+        radius, height = rng.uniform(1.0, 2.0, count), 0.3 * rng.normal(size=count)
+        noise = np.random.default_rng(seed)
+        gone = noise.random(count) < 0.4  # other tussocks, of the same kind, at other places
+        east = np.where(gone, noise.uniform(-290, 290, count), east)
+        north = np.where(gone, noise.uniform(-40, 40, count), north)
+        turn = np.exp(1j * math.radians(60.0 + angle)) * factor
+        place, size = turn * (east + 1j * north), 560
+        cols, rows = np.meshgrid(np.arange(size), np.arange(size))
+        x, y = cols + 0.5 - size / 2, size / 2 - rows - 0.5
+        field = np.zeros((size, size))
+        for p, r, h in zip(place, radius * factor, height, strict=True):
+            c, q = int(p.real + size / 2), int(size / 2 - p.imag)
+            box = np.s_[max(q - 8, 0) : q + 9, max(c - 8, 0) : c + 9]
+            far = (x[box] - p.real) ** 2 + (y[box] - p.imag) ** 2
+            field[box] += h * np.exp(-far / (2 * r**2))
+        home = (x + 1j * y) / turn
+        valid = (np.abs(home.real) < 285) & (np.abs(home.imag) < 30)
+        field += 0.05 * noise.normal(size=field.shape)
+        made.append((np.where(valid, field, np.nan).astype(np.float32), valid))
+    grid = Grid(0.0, 0.0, 1.0, (560, 560), None)
+    dark = np.zeros((560, 560), bool)
+    rasters = [
+        SurveyRaster(grid, h, np.zeros((*h.shape, 3), np.uint8), v, dark, v.astype(np.uint16), 0.0)
+        for h, v in made
+    ]
+    return {"dem": tuple(rasters), "ortho": tuple(rasters)}
+
+
+@pytest.mark.parametrize(("yaw_deg", "scale"), [(5.0, 1.0), (-8.0, 1.0), (0.0, 1.03), (0.0, 0.99)])
+def test_a_long_beach_votes_on_its_own_cells(yaw_deg, scale):
+    turn = vote(strip(yaw_deg, scale), SEARCH, 40.0)
+    assert math.degrees(turn.yaw) == pytest.approx(-yaw_deg, abs=0.2)
+    # a tile that is turned runs off its peak; a turned survey is measured anew once it is straight
+    assert turn.stretch == pytest.approx(1 / scale, abs=0.01 if yaw_deg else 0.002)
+    assert turn.scale == (turn.stretch if scale != 1 else 1.0)
