@@ -22,27 +22,17 @@ State = Literal["ok", "missing", "optional"]
 _APT = {
     "libGL.so.1": "libgl1",
     "libEGL.so.1": "libegl1",
-    "libusb-1.0.so.0": "libusb-1.0-0",
     "libX11.so.6": "libx11-6",
     "libgomp.so.1": "libgomp1",
     "libudev.so.1": "libudev1",
     "libXrender.so.1": "libxrender1",
     "libexpat.so.1": "libexpat1",
 }
-_LIBUSB = """
-from meshreg.open3d_loading import load_libusb
-load_libusb()
-"""
-_OPEN3D = """
-from meshreg.open3d_loading import load_open3d
-import numpy as np
-open3d = load_open3d()
-scene = open3d.t.geometry.RaycastingScene()
-corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float32)
-scene.add_triangles(corners, np.array([[0, 1, 2]], np.uint32))
-hit = scene.cast_rays(np.array([[0.2, 0.2, 1, 0, 0, -1]], np.float32))
-assert abs(float(hit["t_hit"].numpy()[0]) - 1) < 1e-6
-print("Open3D", open3d.__version__)
+_SMALL_GICP = """
+import small_gicp, importlib.metadata as m
+tree = small_gicp.KdTree(small_gicp.PointCloud([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]))
+assert tree.nearest_neighbor_search([0.9, 0.0, 0.0])[1] == 1
+print("small_gicp", m.version("small_gicp"))
 """
 _OPENGL = """
 import pyvista
@@ -124,9 +114,9 @@ def run_probe(code: str, *, seconds: float = 90.0) -> tuple[bool, str]:
 
 
 def has(what: str) -> tuple[bool, str]:
-    """Return whether the machine has "open3d", "opengl", "pye57" or "pycolmap", and why not."""
+    """Return whether the machine has "opengl", "small_gicp", "pye57" or "pycolmap", and why not."""
     probes = {
-        "open3d": _OPEN3D,
+        "small_gicp": _SMALL_GICP,
         "opengl": _OPENGL,
         "pye57": _PYE57,
         "pycolmap": "import pycolmap; print(pycolmap.__version__)",
@@ -140,8 +130,7 @@ def _apt_for(message: str) -> str:
 
 
 def _library(name: str, use: str) -> Check:
-    load = _LIBUSB if name.startswith("libusb") else f"import ctypes; ctypes.CDLL({name!r})"
-    found, said = run_probe(f"{load}\nprint('found')")
+    found, said = run_probe(f"import ctypes; ctypes.CDLL({name!r})\nprint('found')")
     remedy = "" if found else f"apt-get install {_APT[name]}"
     return Check(name, "ok" if found else "optional", use, said, remedy)
 
@@ -206,9 +195,8 @@ _UNSET = "unset PROJ_DATA PROJ_LIB"
 def examine() -> tuple[Check, ...]:
     """Probe the machine; the probes run in child processes, a few at a time (about 10 s)."""
     jobs = [
-        lambda: _library("libGL.so.1", "Open3D, 3-D pictures"),
+        lambda: _library("libGL.so.1", "3-D pictures"),
         lambda: _library("libEGL.so.1", "3-D pictures without a screen"),
-        lambda: _library("libusb-1.0.so.0", "Open3D"),
         lambda: _probe(
             "numba", "kernels", _NUMBA, needed=False, remedy="export XDG_CACHE_HOME=~/.cache"
         ),
@@ -245,11 +233,11 @@ def examine() -> tuple[Check, ...]:
             remedy=_pip("pye57"),
         ),
         lambda: _probe(
-            "Open3D",
+            "small_gicp",
             "refine.surfaces=gicp",
-            _OPEN3D,
+            _SMALL_GICP,
             needed=False,
-            remedy="apt-get install libgl1 libegl1 libusb-1.0-0",
+            remedy=_reinstall("small_gicp"),
         ),
         lambda: _probe(
             "3-D rendering",

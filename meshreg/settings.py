@@ -188,9 +188,7 @@ class RefineSettings(Checked):
     """From a cell to a millimetre (`meshreg.refine`, `heights`, `surfaces`)."""
 
     section: ClassVar[str] = "refine"
-    surfaces: str = choice(
-        "none", "gicp: a last step on the 3-D surfaces, with Open3D", ("none", "gicp")
-    )
+    surfaces: str = choice("none", "gicp: a last step on the 3-D surfaces", ("none", "gicp"))
 
 
 @dataclass(frozen=True)

@@ -1,10 +1,13 @@
 """The last millimetres on the 3-D surfaces themselves: generalized ICP from the pose found.
 
 A DEM sees a reef from above; its overhangs and walls, where much of the coral is, are seen only
-here. Opt-in (`refine.surfaces = "gicp"`), since it needs Open3D, and believed only where it is a
-small step that makes the surfaces agree better. It looks at ground that has not changed, as the
+here. Opt-in (`refine.surfaces = "gicp"`), and believed only where it is a small step that makes the
+surfaces agree better. It looks at ground that has not changed, as the
 heights tell it, and is never surer than what it started from: a fit of points that lie close
 already does not see how the models bend.
+
+Generalized ICP (Segal, Haehnel and Thrun, RSS 2009) is small_gicp's, in one thread, so that the
+same points give the same answer.
 """
 
 from __future__ import annotations
@@ -125,11 +128,11 @@ def polish(
     Raises
     ------
     UsageError
-        If Open3D cannot be imported.
+        If small_gicp cannot be imported.
     """
     if isinstance(reference.geometry, Maps) or isinstance(moving.geometry, Maps):
         return _kept(transform, "maps have no 3-D surface to polish on")
-    o3d = _open3d()
+    gicp = _small_gicp()
     if stable is None:
         return _kept(transform, "too little stable ground to polish on")
     home = transform.apply(place)
@@ -138,34 +141,30 @@ def polish(
     points = sampled(moving, max_points, rng)
     loose, trusted = transform.apply(points) - home, _trusted(points, *stable)
     fixed, (loose, trusted) = _shared(fixed, loose, trusted)
-    if min(len(fixed), int(trusted.sum())) < 1000:
+    loose = loose[trusted]
+    if min(len(fixed), len(loose)) < 1000:
         return _kept(transform, "too few points in common to polish on")
-    clouds = [o3d.geometry.PointCloud(o3d.utility.Vector3dVector(p)) for p in (loose, fixed)]
+    clouds = [gicp.PointCloud(points) for points in (fixed, loose)]
     for cloud in clouds:
-        cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(20))
-    clouds[0], loose = clouds[0].select_by_index(np.flatnonzero(trusted)), loose[trusted]
-    pipeline = o3d.pipelines.registration
-    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
-        start = pipeline.evaluate_registration(*clouds, GATE, np.eye(4))
-        if start.fitness < 0.1:
-            return _kept(transform, "the surfaces lie too far apart to polish on")
-        kernel = pipeline.TukeyLoss(k=GATE)
-        found = pipeline.registration_generalized_icp(
-            *clouds,
-            GATE,
-            np.eye(4),
-            pipeline.TransformationEstimationForGeneralizedICP(kernel),
-            pipeline.ICPConvergenceCriteria(1e-9, 1e-9, 60),
-        )
-    step = _proper(np.asarray(found.transformation))
-    moved = np.abs(step.offset)
-    (before, _), (after, scatter) = (
-        _agreement(fixed, np.asarray(clouds[1].normals), s.apply(loose))
-        for s in (Transform(), step)
+        gicp.estimate_normals_covariances(cloud, num_neighbors=20)
+    normals = clouds[0].normals()[:, :3]
+    before, share, _ = _agreement(fixed, normals, loose)
+    if share < 0.1:
+        return _kept(transform, "the surfaces lie too far apart to polish on")
+    found = gicp.align(
+        *clouds,
+        gicp.KdTree(clouds[0]),
+        max_correspondence_distance=GATE,
+        max_iterations=60,
+        rotation_epsilon=1e-7,
+        translation_epsilon=1e-7,
     )
+    step = _proper(np.asarray(found.T_target_source))
+    moved = np.abs(step.offset)
+    after, share_after, scatter = _agreement(fixed, normals, step.apply(loose))
     sigma = np.array([error[axis] for axis in "xyz"]) if error else np.zeros(3)
     small = bool((moved <= np.maximum(3 * sigma, GATE)).all())
-    better = after < before and found.fitness >= 0.98 * start.fitness
+    better = after < before and share_after >= 0.98 * share
     length = float(np.linalg.norm(step.offset))
     if not (small and better):
         why = "it does not bring them closer" if small else f"it would move it by {length:.3f} m"
@@ -226,8 +225,8 @@ def _shared(fixed: Float64, loose: Float64, trusted: Bool) -> tuple[Float64, tup
     return fixed[kept[0]], (loose[kept[1]], trusted[kept[1]])
 
 
-def _agreement(fixed: Float64, normals: Float64, loose: Float64) -> tuple[float, Float64]:
-    """Rms distance [m] from the tangent planes, and the block covariance (6, 6) of the fit.
+def _agreement(fixed: Float64, normals: Float64, loose: Float64) -> tuple[float, float, Float64]:
+    """Rms distance [m] from the tangent planes, share within the gate, covariance (6, 6).
 
     With ``r = n . (p - q)`` and ``J = (n, p × n)``, weights by Tukey's biweight over the gate: the
     sandwich (`meshreg.sandwich`) over square blocks of ground, as of the heights. Zero where fewer
@@ -239,10 +238,10 @@ def _agreement(fixed: Float64, normals: Float64, loose: Float64) -> tuple[float,
     far, which = cKDTree(fixed).query(loose, distance_upper_bound=GATE)
     near = np.isfinite(far)
     if not near.any():
-        return float("nan"), np.zeros((6, 6))
+        return float("nan"), 0.0, np.zeros((6, 6))
     points, normal = loose[near], normals[which[near]]
     along = ((points - fixed[which[near]]) * normal).sum(axis=1)
-    rms = float(np.sqrt(np.mean(along**2)))
+    rms, share = float(np.sqrt(np.mean(along**2))), float(near.mean())
     design = np.hstack([normal, np.cross(points, normal)])
     weight = (1 - (along / GATE) ** 2) ** 2
     low = points[:, :2].min(axis=0)
@@ -251,10 +250,10 @@ def _agreement(fixed: Float64, normals: Float64, loose: Float64) -> tuple[float,
     _, block = np.unique(cell[:, 0] * (BLOCKS + 1) + cell[:, 1], return_inverse=True)
     count = int(block.max()) + 1
     if count < 12:
-        return rms, np.zeros((6, 6))
+        return rms, share, np.zeros((6, 6))
     scores = design * (weight * along)[:, None]
     curvature = (design * weight[:, None]).T @ design
-    return rms, block_sandwich(curvature, scores, block, design.shape[1])
+    return rms, share, block_sandwich(curvature, scores, block, design.shape[1])
 
 
 def _proper(matrix: Float64) -> Transform:
@@ -268,13 +267,12 @@ def _kept(transform: Transform, why: str) -> Polished:
     return Polished(transform, False, 0.0, nan, nan, why)
 
 
-def _open3d() -> Any:
-    from meshreg.open3d_loading import load_open3d
-
+def _small_gicp() -> Any:
     try:
-        return load_open3d()
+        import small_gicp
     except (ImportError, OSError) as error:
         raise UsageError(
-            f"refine.surfaces is 'gicp', but Open3D cannot be imported: {error}.",
+            f"refine.surfaces is 'gicp', but small_gicp cannot be imported: {error}.",
             remedy="Run `meshreg doctor` to see what is missing, or leave it at 'none'.",
         ) from error
+    return small_gicp

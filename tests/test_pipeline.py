@@ -108,7 +108,7 @@ def test_a_tilted_survey_is_levelled():
     assert (stated[:, 2] > at[2]).all()  # a tilt's doubt grows with the lever
 
 
-@pytest.mark.needs("open3d")
+@pytest.mark.needs("small_gicp")
 def test_surfaces_polish_a_registration():
     first, _ = floors()
     reference = survey(first, half=3.0, seed=1)
