@@ -55,42 +55,45 @@ def _write(
     from meshreg import __version__
 
     with atomic_file(path) as temporary, environment():
-        import rasterio
         from rasterio import Affine
         from rasterio.crs import CRS
         from rasterio.enums import ColorInterp
         from rasterio.errors import RasterioError
-        from rasterio.io import MemoryFile  # noqa: F401  (registers drivers)
+        from rasterio.io import MemoryFile
 
         crs = None if grid.crs is None else CRS.from_wkt(parse_crs(grid.crs).to_wkt())
+        # GDAL writes some blocks while it closes a file, and a full disk is then no error to it.
+        # In its memory there is none, and what Python writes fails where it fails.
         try:
-            with rasterio.open(
-                temporary,
-                "w",
-                driver="COG",
-                width=grid.shape[1],
-                height=grid.shape[0],
-                count=len(bands),
-                dtype=bands.dtype,
-                crs=crs,
-                transform=Affine(grid.cell, 0, grid.west, 0, -grid.cell, grid.north),
-                nodata=nodata,
-                compress="DEFLATE",
-                predictor="YES",
-                bigtiff="IF_SAFER",
-                overview_resampling="AVERAGE",
-            ) as dataset:
-                dataset.write(bands)
-                dataset.update_tags(AREA_OR_POINT="Area", TIFFTAG_SOFTWARE=f"meshreg {__version__}")
-                if len(bands) == 4:
-                    dataset.colorinterp = [
-                        ColorInterp.red,
-                        ColorInterp.green,
-                        ColorInterp.blue,
-                        ColorInterp.alpha,
-                    ]
-                if units:
-                    dataset.units = (units,) * len(bands)
+            with MemoryFile(ext=".tif") as memory:
+                with memory.open(
+                    driver="COG",
+                    width=grid.shape[1],
+                    height=grid.shape[0],
+                    count=len(bands),
+                    dtype=bands.dtype,
+                    crs=crs,
+                    transform=Affine(grid.cell, 0, grid.west, 0, -grid.cell, grid.north),
+                    nodata=nodata,
+                    compress="DEFLATE",
+                    predictor="YES",
+                    bigtiff="IF_SAFER",
+                    overview_resampling="AVERAGE",
+                ) as dataset:
+                    dataset.write(bands)
+                    dataset.update_tags(
+                        AREA_OR_POINT="Area", TIFFTAG_SOFTWARE=f"meshreg {__version__}"
+                    )
+                    if len(bands) == 4:
+                        dataset.colorinterp = [
+                            ColorInterp.red,
+                            ColorInterp.green,
+                            ColorInterp.blue,
+                            ColorInterp.alpha,
+                        ]
+                    if units:
+                        dataset.units = (units,) * len(bands)
+                temporary.write_bytes(memory.getbuffer())
         except RasterioError as error:
             raise OutputError(f"cannot be written: {error}.", file=path, remedy=_RETURN) from error
         _check(bands, grid, temporary, path)

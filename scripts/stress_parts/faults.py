@@ -77,6 +77,7 @@ class Usual:
     calls: int
     events: int
     size: int
+    before: int
 
 
 def snapshot(folder: Path) -> Snapshot:
@@ -193,8 +194,16 @@ def usual(bench: Bench, job: Job) -> Usual:
     bench.lay(job)
     sink = bench.work / "events"
     bench.run(command, prepare=lambda: counting.start(sink))
-    size = sum(path.stat().st_size for path in bench.there.rglob("*") if path.is_file())
-    return Usual(warm, lefts[0], same, ended.calls, len(sink.read_bytes()), size)
+    size = room(bench.there)
+    bench.lay(job)
+    before = room(bench.there)
+    return Usual(warm, lefts[0], same, ended.calls, len(sink.read_bytes()), size, before)
+
+
+def room(folder: Path) -> int:
+    """Bytes that the files and folders in a folder take on a disk of 4 KiB pages."""
+    sizes = [path.stat().st_size if path.is_file() else 0 for path in folder.rglob("*")]
+    return sum(-(-size // 4096) * 4096 + 4096 for size in sizes)
 
 
 class Events:
@@ -285,8 +294,7 @@ def disturb(bench: Bench, job: Job, usual: Usual, fault: str, k: int) -> tuple[E
     if disk:
         bench.clear()
         # room for what is there before, and for a part of what is written
-        older = usual.size if job.before is not None else 0
-        options = f"size={int(older * 1.1 + usual.size * part) + 16384}"
+        options = f"size={usual.before + 16384 + int(usual.size * part)}"
         subprocess.run(
             ["mount", "-t", "tmpfs", "-o", options, "meshreg", str(bench.there)], check=True
         )

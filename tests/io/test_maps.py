@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -796,3 +798,43 @@ def test_what_does_not_read_back_is_not_kept(tmp_path, monkeypatch):
 def test_folder_that_is_not_there(tmp_path):
     with pytest.raises(OutputError):
         maps.write_raster(raster(), tmp_path / "no" / "dem.tif")
+
+
+_FILLING = """
+import resource, signal, sys
+import numpy as np
+import subprocess
+import sys
+from pathlib import Path
+from meshreg.errors import OutputError
+from meshreg.io.geotiff_write import write_height
+from meshreg.types import Grid
+
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+folder = Path(sys.argv[1])
+height = np.random.default_rng(0).normal(size=(600, 700)).astype(np.float32)
+write_height(height, Grid(0.0, 600.0, 1.0, height.shape), folder / "whole.tif")
+whole = (folder / "whole.tif").read_bytes()
+for part in (0.0, 0.001, 0.1, 0.5, 0.9, 0.99, 0.99999, 1.0):
+    size = int(part * len(whole))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, resource.RLIM_INFINITY))
+    try:
+        write_height(height, Grid(0.0, 600.0, 1.0, height.shape), folder / "part.tif")
+    except OutputError as error:
+        assert part < 1.0, error
+        assert "What was there before is intact" in str(error), error
+        assert [path.name for path in folder.iterdir()] == ["whole.tif"]
+    else:
+        assert part == 1.0, part
+        assert (folder / "part.tif").read_bytes() == whole
+print("done")
+"""
+
+
+def test_a_disk_that_is_full_at_any_byte_is_an_error(tmp_path):
+    """GDAL itself is silent where the blocks fail that it writes while it closes a file."""
+    done = subprocess.run(
+        [sys.executable, "-c", _FILLING, tmp_path], capture_output=True, text=True, check=False
+    )
+    assert done.stdout == "done\n", done.stderr
+    assert done.stderr == ""  # GDAL writes nothing to the disk that it could complain of
