@@ -14,7 +14,7 @@ from rich.table import Table
 
 from meshreg.cli_parts.common import LOG
 from meshreg.cli_parts.console import Voice
-from meshreg.errors import InputError, UsageError
+from meshreg.errors import InputError, OutputError, UsageError
 
 if TYPE_CHECKING:
     from meshreg.decision import Manual
@@ -205,11 +205,19 @@ def _overlap(out: Path) -> Float64 | None:
 
 
 def remake_report(out: Path) -> None:
-    """Make OUT/report.html again, so that it leads to the comparison; its failure loses nothing."""
+    """Make OUT/report.html again, so that it leads to the comparison; its failure loses nothing.
+
+    Raises
+    ------
+    OutputError
+        If it cannot be written.
+    """
     from meshreg.cli_parts.reporting import write_report
 
     try:
         write_report(out)
+    except OutputError:
+        raise
     except Exception as error:
         LOG.warning("report.html was not made again: %s: %s", type(error).__name__, error)
         LOG.debug("why", exc_info=True)
