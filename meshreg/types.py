@@ -73,12 +73,16 @@ class Frame:
     crs : str or None
         The metric CRS of absolute coordinates. Where it differs from `file_crs`, points pass
         through PROJ after the shift (`meshreg.io.frames`).
+    local : str or None
+        WKT of a local (engineering) CRS that the file states. It says nothing about the place on
+        Earth and is used for nothing but to be written again.
     """
 
     axes: Float64 = field(default_factory=lambda: np.eye(3))
     shift: Float64 = field(default_factory=lambda: np.zeros(3))
     file_crs: str | None = None
     crs: str | None = None
+    local: str | None = None
 
     def __post_init__(self) -> None:
         _put(self, "axes", _frozen(self.axes, np.float64, (3, 3), "Frame.axes"))

@@ -8,7 +8,14 @@ import numpy as np
 
 from meshreg.checked import shown
 from meshreg.errors import InputError, UsageError
-from meshreg.io.crs import check_area, crs_name, crs_text, metres_per_unit, metric_crs
+from meshreg.io.crs import (
+    check_area,
+    crs_name,
+    crs_text,
+    metres_per_unit,
+    metric_crs,
+    parse_crs,
+)
 from meshreg.io.options import UNIT_RANGE, ReadOptions
 from meshreg.io.sidecar import SidecarInfo
 from meshreg.types import Float64, Frame
@@ -73,12 +80,17 @@ def frame_from(
     if shift.shape != (3,) or not np.isfinite(shift).all():
         raise UsageError(f"shift is {shift.tolist()}; it needs three finite numbers.")
     if crs is None:
-        return Frame(axes, shift)
+        return Frame(axes, shift, local=_local(options.crs or said.crs or file_crs))
     if centre is None:
         raise UsageError("The centre of the coordinates is needed to place them in their CRS.")
     place = axes @ np.asarray(centre, float) + shift
     check_area(crs, *place)
     return Frame(axes, shift, crs, metric_crs(crs, place))
+
+
+def _local(crs: str | None) -> str | None:
+    """Return a local (engineering) CRS as WKT; None where no CRS is stated at all."""
+    return None if crs is None else str(parse_crs(crs).to_wkt())
 
 
 def _file_crs(options: ReadOptions, said: SidecarInfo, file_crs: str | None) -> str | None:

@@ -16,10 +16,10 @@ import numpy as np
 
 from meshreg.errors import InputError, MeshregError, ResourceLimitError
 from meshreg.io.crs import crs_text, mend_proj_data
+from meshreg.io.geotiff_sides import MAGIC, Sides
 from meshreg.io.safe import FARTHEST, beside, open_regular
 from meshreg.types import Float64
 
-MAGIC = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 _WINDOW = 1 << 24  # pixels decoded at once
 _DENSEST = 5000  # pixels that one byte of a compressed file may stand for
 _WORLD_FILES = (".tfw", ".TFW", ".tifw", ".tiffw", ".wld")
@@ -116,17 +116,19 @@ def windows(dataset: Any) -> Iterator[Any]:
         yield Window(0, row, dataset.width, min(step, dataset.height - row))
 
 
-def lattice(dataset: Any, path: Path) -> Float64:
+def lattice(dataset: Any, path: Path, sides: Sides | None = None) -> Float64:
     """Return the (2, 3) matrix from (col, row, 1) of outer pixel corners to file x, y.
 
     A file whose pixels are points (AREA_OR_POINT=Point) is given by GDAL as areas already, half a
-    pixel outward of its tie point. Without georeference in the file, a world file beside it counts.
+    pixel outward of its tie point. A georeference in .aux.xml replaces the file's own; without
+    either a world file beside it counts.
     """
     affine = dataset.transform
     matrix = np.array([[affine.a, affine.b, affine.c], [affine.d, affine.e, affine.f]], float)
-    if affine.is_identity:
-        named = (beside(path.parent, path.with_suffix(suffix).name) for suffix in _WORLD_FILES)
-        world = next((file for file in named if file is not None), None)
+    if sides is not None and sides.matrix is not None:
+        matrix = sides.matrix
+    elif affine.is_identity:
+        world = _world_beside(path)
         if world is None:
             where = "ground control points only" if dataset.gcps[0] else "no georeference"
             raise InputError(
@@ -156,6 +158,11 @@ def lattice(dataset: Any, path: Path) -> Float64:
     return matrix
 
 
+def _world_beside(path: Path) -> Path | None:
+    named = (beside(path.parent, path.with_suffix(suffix).name) for suffix in _WORLD_FILES)
+    return next((file for file in named if file is not None), None)
+
+
 def _world_file(path: Path) -> Float64:
     """Read six numbers: x and y steps by column, by row, and the CENTRE of the first pixel."""
     with open_regular(path) as stream:
@@ -169,11 +176,55 @@ def _world_file(path: Path) -> Float64:
     return np.array([[a, b, c - (a + b) / 2], [d, e, f - (d + e) / 2]])
 
 
-def crs_of(dataset: Any, path: Path) -> str | None:
-    """Return the CRS of a dataset in the spelling of `crs_text`; None for a local one."""
-    if dataset.crs is None:
+def place_notes(dataset: Any, path: Path, sides: Sides) -> list[str]:
+    """Say where side files and the file itself give different places, and which one counts."""
+    notes = []
+    affine = dataset.transform
+    own = np.array([[affine.a, affine.b, affine.c], [affine.d, affine.e, affine.f]], float)
+    ends = np.array([[0, 0, 1], [dataset.width, dataset.height, 1]], float).T
+    pixel = max(np.abs(own[:, :2]).max(), 1e-300)
+    if affine.is_identity:
+        pass
+    elif sides.matrix is not None:
+        if np.abs((sides.matrix - own) @ ends).max() > 0.01 * pixel:
+            notes.append(f"{path.name}.aux.xml gives another place than the file; it counts.")
+    elif (world := _world_beside(path)) is not None:
+        try:
+            differs = np.abs((_world_file(world) - own) @ ends).max() > 0.01 * pixel
+        except InputError:
+            differs = True
+        if differs:
+            notes.append(f"{world.name} gives another place than the file, which counts.")
+    if sides.crs is not None and dataset.crs is not None:
+        one, two = crs_of(dataset, path), crs_of(dataset, path, sides)
+        if one != two:
+            notes.append(f"{path.name}.aux.xml gives another CRS than the file; it counts.")
+    return notes
+
+
+def local_crs_of(dataset: Any, sides: Sides | None = None) -> str | None:
+    """Return the WKT of a dataset's local (engineering) CRS; None for any other, or none."""
+    from meshreg.io.crs import parse_crs
+
+    wkt = sides.crs if sides is not None and sides.crs else None
+    if wkt is None and dataset.crs is not None:
+        wkt = dataset.crs.to_wkt()
+    if not wkt:
         return None
-    wkt = dataset.crs.to_wkt()
+    try:
+        return wkt if parse_crs(wkt).is_engineering else None
+    except InputError:
+        return None
+
+
+def crs_of(dataset: Any, path: Path, sides: Sides | None = None) -> str | None:
+    """Return the CRS of a dataset in the spelling of `crs_text`; None for a local one."""
+    if sides is not None and sides.crs is not None:
+        wkt = sides.crs
+    elif dataset.crs is None:
+        return None
+    else:
+        wkt = dataset.crs.to_wkt()
     try:
         return crs_text(wkt)
     except InputError as error:

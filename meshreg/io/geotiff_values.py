@@ -8,14 +8,24 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from meshreg.errors import InputError, UsageError
-from meshreg.io.geotiff import EXPORT, crs_of, lattice, opened, windows
+from meshreg.io.geotiff import (
+    EXPORT,
+    crs_of,
+    lattice,
+    local_crs_of,
+    opened,
+    place_notes,
+    windows,
+)
+from meshreg.io.geotiff_sides import read_mask_file, read_sides
 from meshreg.types import Bool, Float32, Float64, UInt8
 
 # Written without being declared, by Metashape, PDAL, ODM, CODEM, ASP, and as others' defaults.
@@ -24,6 +34,7 @@ _HUGE = (-3.4028234663852886e38, 3.4028234663852886e38, 1.70141e38, 9.9692099683
 NODATA = (-9999.0, -10000.0, -32767.0, -32768.0, -99999.0, -1e6, *_HUGE, 0.0)
 _HIGHEST = 1e9  # heights from here on are damage, in whatever unit
 NODATA_COLORS = (0, 255)
+_STALE = re.compile(r"AREA_OR_POINT|STATISTICS_|TIFFTAG_(SOFTWARE|[XY]?RESOLUTION)|OVERVIEW|OVR")
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +52,10 @@ class RawMap:
     unit : str
         Unit of the band, as written; "" where it does not say.
     notes : tuple of str
+    local : str or None
+        WKT of the file's local (engineering) CRS, which says nothing about the place on Earth.
+    tags : mapping
+        What the file says of itself beside.
     """
 
     path: Path
@@ -50,6 +65,8 @@ class RawMap:
     crs: str | None
     unit: str
     notes: tuple[str, ...]
+    local: str | None = None
+    tags: Mapping[str, str] = field(default_factory=dict)
 
 
 def read_height(path: Path, max_pixels: int) -> RawMap:
@@ -65,24 +82,40 @@ def read_height(path: Path, max_pixels: int) -> RawMap:
     ResourceLimitError
         More than `max_pixels`.
     """
-    notes: list[str] = []
+    sides = read_sides(path)
+    notes: list[str] = list(sides.notes)
     with opened(path, max_pixels) as dataset:
-        matrix, crs = lattice(dataset, path), crs_of(dataset, path)
+        matrix, crs = lattice(dataset, path, sides), crs_of(dataset, path, sides)
+        local, tags = local_crs_of(dataset, sides), _tags(dataset)
+        notes += place_notes(dataset, path, sides)
         if np.dtype(dataset.dtypes[0]).kind not in "iuf":
             raise InputError(f"holds {dataset.dtypes[0]}, not heights.", file=path, remedy=EXPORT)
         others = [c.name for c in dataset.colorinterp[1:] if c.name != "alpha"]
         if others:
             notes.append(f"The first of {dataset.count} bands was taken as height.")
         scale, offset = dataset.scales[0], dataset.offsets[0]
+        if (scale, offset) == (1, 0):
+            scale = 1.0 if sides.scale is None else sides.scale
+            offset = 0.0 if sides.offset is None else sides.offset
+        declared = dataset.nodata
+        beside = None  # the value in .aux.xml, as the band's type holds it
+        if declared is None and sides.nodata is not None:
+            declared = sides.nodata
+            with np.errstate(all="ignore"):
+                beside = float(np.array(sides.nodata, np.float64).astype(dataset.dtypes[0]))
+        mask = read_mask_file(sides, dataset.shape, opened, notes)
         values = np.empty(dataset.shape, np.float32)
         for window in windows(dataset):
             rows = slice(window.row_off, window.row_off + window.height)
             with np.errstate(all="ignore"):  # what is not finite becomes NaN below
                 part = dataset.read(1, window=window).astype(np.float64)
                 part[dataset.read_masks(1, window=window) < 128] = np.nan
+                if beside is not None:
+                    part[part == beside] = np.nan
+                if mask is not None:
+                    part[~mask[rows]] = np.nan
                 values[rows] = part * scale + offset if (scale, offset) != (1, 0) else part
-        declared = dataset.nodata
-        unit = (dataset.units[0] or "").strip()
+        unit = (dataset.units[0] or "").strip() or sides.unit
     values[~np.isfinite(values)] = np.nan
     _drop_undeclared(values, notes)
     _require_heights(values, path)
@@ -90,7 +123,13 @@ def read_height(path: Path, max_pixels: int) -> RawMap:
     if not valid.any():
         raise InputError("holds no height: every cell is without data.", file=path, remedy=EXPORT)
     _warn_of_nodata_in_range(values, declared, scale, offset, notes)
-    return RawMap(path, values, valid, matrix, crs, unit, tuple(notes))
+    return RawMap(path, values, valid, matrix, crs, unit, tuple(notes), local, tags)
+
+
+def _tags(dataset: Any) -> dict[str, str]:
+    """Return a file's own tags that hold for its moved copy too."""
+    found = {str(key): str(value) for key, value in dataset.tags().items()}
+    return {key: value for key, value in found.items() if not _STALE.match(key)}
 
 
 def _require_heights(values: Float32, path: Path) -> None:
@@ -155,9 +194,14 @@ def read_color(path: Path, max_pixels: int) -> RawMap:
     ResourceLimitError
         More than `max_pixels`.
     """
-    notes: list[str] = []
+    sides = read_sides(path)
+    notes: list[str] = list(sides.notes)
     with opened(path, max_pixels) as dataset:
-        matrix, crs = lattice(dataset, path), crs_of(dataset, path)
+        matrix, crs = lattice(dataset, path, sides), crs_of(dataset, path, sides)
+        local, tags = local_crs_of(dataset, sides), _tags(dataset)
+        notes += place_notes(dataset, path, sides)
+        mask = read_mask_file(sides, dataset.shape, opened, notes)
+        beside = sides.nodata if dataset.nodata is None else None
         bands, palette = _color_bands(dataset)
         factor = _color_factor(dataset, bands, path, notes) if palette is None else 1.0
         colors = np.empty((*dataset.shape, 3), np.uint8)
@@ -166,6 +210,10 @@ def read_color(path: Path, max_pixels: int) -> RawMap:
             rows = slice(window.row_off, window.row_off + window.height)
             part = dataset.read(bands, window=window)
             valid[rows] = dataset.dataset_mask(window=window) >= 128
+            if mask is not None:
+                valid[rows] &= mask[rows]
+            if beside is not None:
+                valid[rows] &= (part != beside).any(axis=0)
             if palette is not None:
                 colors[rows] = palette[part[0]]
             else:
@@ -175,12 +223,12 @@ def read_color(path: Path, max_pixels: int) -> RawMap:
         undeclared = all(
             flag.name == "all_valid" for flags in dataset.mask_flag_enums for flag in flags
         )
-    if undeclared:
+    if undeclared and mask is None and beside is None:
         _drop_undeclared_color(colors, valid, notes)
     if not valid.any():
         raise InputError("holds no colour: every pixel is masked.", file=path, remedy=EXPORT)
     colors[~valid] = 0
-    return RawMap(path, colors, valid, matrix, crs, "", tuple(notes))
+    return RawMap(path, colors, valid, matrix, crs, "", tuple(notes), local, tags)
 
 
 def _color_bands(dataset: Any) -> tuple[list[int], UInt8 | None]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +22,17 @@ NODATA = -9999.0
 _RETURN = "Check free space and run again."
 
 
-def write_height(height: Float32, grid: Grid, path: Path) -> None:
+def write_height(
+    height: Float32,
+    grid: Grid,
+    path: Path,
+    *,
+    local: str | None = None,
+    tags: Mapping[str, str] | None = None,
+) -> None:
     """Write heights (H, W) float32 [m], NaN where there is none (-9999 in the file, declared).
+
+    `local` is the WKT of a local CRS, for a grid that has none on Earth; `tags` are added.
 
     Raises
     ------
@@ -32,11 +42,21 @@ def write_height(height: Float32, grid: Grid, path: Path) -> None:
     values = np.where(np.isfinite(height), height, np.float32(NODATA)).astype(np.float32)
     if (height == NODATA).any():
         log.warning("%s: heights of exactly %g become no data.", path, NODATA)
-    _write(values[None], grid, path, nodata=NODATA, units="metre")
+    _write(values[None], grid, path, nodata=NODATA, units="metre", local=local, tags=tags)
 
 
-def write_color(color: UInt8, valid: Bool, grid: Grid, path: Path) -> None:
+def write_color(
+    color: UInt8,
+    valid: Bool,
+    grid: Grid,
+    path: Path,
+    *,
+    local: str | None = None,
+    tags: Mapping[str, str] | None = None,
+) -> None:
     """Write colours (H, W, 3) uint8 with an alpha band that is 255 where `valid` (H, W), else 0.
+
+    `local` and `tags` as for `write_height`.
 
     Raises
     ------
@@ -46,11 +66,18 @@ def write_color(color: UInt8, valid: Bool, grid: Grid, path: Path) -> None:
     bands = np.empty((4, *valid.shape), np.uint8)
     bands[:3] = np.moveaxis(color, 2, 0)
     bands[3] = np.where(valid, 255, 0)
-    _write(bands, grid, path)
+    _write(bands, grid, path, local=local, tags=tags)
 
 
 def _write(
-    bands: NDArray[Any], grid: Grid, path: Path, nodata: float | None = None, units: str = ""
+    bands: NDArray[Any],
+    grid: Grid,
+    path: Path,
+    *,
+    nodata: float | None = None,
+    units: str = "",
+    local: str | None = None,
+    tags: Mapping[str, str] | None = None,
 ) -> None:
     from meshreg import __version__
 
@@ -62,6 +89,8 @@ def _write(
         from rasterio.io import MemoryFile
 
         crs = None if grid.crs is None else CRS.from_wkt(parse_crs(grid.crs).to_wkt())
+        if crs is None and local is not None:
+            crs = CRS.from_wkt(local)
         # GDAL writes some blocks while it closes a file, and a full disk is then no error to it.
         # In its memory there is none, and what Python writes fails where it fails.
         try:
@@ -81,6 +110,7 @@ def _write(
                     overview_resampling="AVERAGE",
                 ) as dataset:
                     dataset.write(bands)
+                    dataset.update_tags(**(tags or {}))
                     dataset.update_tags(
                         AREA_OR_POINT="Area", TIFFTAG_SOFTWARE=f"meshreg {__version__}"
                     )

@@ -232,10 +232,12 @@ def rewrite(source: SourceFile, move: Mover, path: Path) -> tuple[Path, ...]:
     values, valid = regrid(
         raw.values, raw.valid, placed, grid, is_height=not picture, surface=surface
     )
+    local = move.frame.local or raw.local
     if picture:
-        write_color(np.asarray(values, np.uint8), valid, grid, path)
+        color = np.asarray(values, np.uint8)
+        write_color(color, valid, grid, path, local=local, tags=raw.tags)
     else:
-        write_height(np.asarray(values, np.float32), grid, path)
+        write_height(np.asarray(values, np.float32), grid, path, local=local, tags=raw.tags)
     return (path,)
 
 

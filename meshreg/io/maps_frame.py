@@ -39,9 +39,10 @@ def map_frame(raw: RawMap, options: ReadOptions, sidecar: SidecarInfo | None) ->
     rows, cols = raw.valid.shape
     centre = np.array([*(raw.matrix @ [cols / 2, rows / 2, 1]), level_of(raw)])
     try:
-        return frame_from(
+        frame = frame_from(
             plain, replace(said, unit=None, axes=None, up=None), raw.crs, axes, centre=centre
         )
+        return frame if frame.local or frame.crs else replace(frame, local=raw.local)
     except MeshregError as error:
         error.file = error.file or str(raw.path)
         raise

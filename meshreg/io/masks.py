@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from meshreg.errors import InputError, MeshregError
-from meshreg.io import geotiff
+from meshreg.io import geotiff, geotiff_sides
 from meshreg.io.bridge import bridge
 from meshreg.io.crs import crs_text
 from meshreg.io.mask_polygons import (
@@ -145,7 +145,7 @@ def read_mask(
         head = stream.read(16)
     target = crs_text(crs) if crs else None
     try:
-        if head[:4] in geotiff.MAGIC:
+        if head[:4] in geotiff_sides.MAGIC:
             raster = _read_raster(path)
             own = raster.crs
             mask = Mask(path, target, (), replace(raster, crs=own or target), invert)

@@ -39,8 +39,8 @@ def write_shift(path: Path, frame: Frame, *, carries_crs: bool = False) -> tuple
     offset, survey = path.with_name(f"{stem}_offset.xyz"), path.with_name(f"{stem}.survey.toml")
     said = _frame_words(frame)
     plain = not said
-    if frame.file_crs is not None and not carries_crs:
-        said["crs"] = frame.file_crs
+    if not carries_crs and (crs := frame.file_crs or frame.local) is not None:
+        said["crs"] = crs
     shift = [float(value) for value in frame.shift]
     written = []
     if plain and any(shift):
