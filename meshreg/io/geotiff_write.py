@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from meshreg.errors import InputError, OutputError
 from meshreg.io.crs import parse_crs
 from meshreg.io.geotiff import environment, opened, windows
-from meshreg.io.safe import atomic_file
+from meshreg.io.safe import atomic_file, open_regular
 from meshreg.types import Bool, Float32, Grid, UInt8
 
 log = logging.getLogger("meshreg")
@@ -139,5 +139,31 @@ def _check(bands: NDArray[Any], grid: Grid, temporary: Path, path: Path) -> None
                 same = same and np.array_equal(dataset.read(window=window), bands[:, rows])
     except InputError as error:
         raise OutputError(error.message, file=path, remedy=_RETURN) from error
-    if not same:
+    if not (same and _tags_agree(grid, temporary)):
         raise OutputError("does not read back as written.", file=path, remedy=_RETURN)
+
+
+def _tags_agree(grid: Grid, written: Path) -> bool:
+    """Whether the tags say the grid to Pillow too, which has not written them.
+
+    OGC GeoTIFF 1.1, requirements class 8: model = tie point + pixel times scale.
+    """
+    from PIL import TiffImagePlugin
+
+    with open_regular(written) as stream:
+        head = stream.read(8)
+        if head[2:3] == b"+" or head[3:4] == b"+":  # BigTIFF
+            head += stream.read(8)
+        tags = TiffImagePlugin.ImageFileDirectory_v2(head)
+        stream.seek(tags.next)
+        tags.load(stream)
+        size, scale, tie = (tags.get(number) for number in (257, 33550, 33922))
+        wide = tags.get(256)
+    if scale is None or tie is None:
+        return False
+    corner = (tie[3] - tie[0] * scale[0], tie[4] + tie[1] * scale[1])
+    return (
+        (size, wide) == tuple(grid.shape)
+        and np.allclose(scale[:2], grid.cell, rtol=1e-12, atol=0)
+        and np.allclose(corner, (grid.west, grid.north), rtol=1e-14, atol=1e-9)
+    )

@@ -26,6 +26,7 @@ from meshreg.io.rewriting import (
     require_unchanged,
 )
 from meshreg.io.safe import atomic_file, file_bytes
+from meshreg.io.second_reader import require_glb
 from meshreg.types import Float64, SourceFile
 
 _BENT = 1e-3  # most that a change of CRS may bend a survey moved by one matrix [m]
@@ -83,6 +84,7 @@ def rewrite(source: SourceFile, move: Mover, path: Path) -> tuple[Path, ...]:
         again = read_geometry(read_document(temporary))
         tolerance = 1e-12 * (np.abs(expected).max(initial=0) + np.abs(points).max(initial=0))
         require_close(again, expected, tolerance, path)
+        require_glb(source.path, temporary, move.matrix, path)
     return (path, *copies)
 
 

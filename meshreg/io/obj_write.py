@@ -26,6 +26,7 @@ from meshreg.io.rewriting import (
     require_unchanged,
 )
 from meshreg.io.safe import atomic_file, open_regular
+from meshreg.io.second_reader import ANYTHING, Expected, LineRule, require_lines
 from meshreg.io.sidecar import write_shift
 from meshreg.types import Float64, Frame, Mesh, PointCloud, SourceFile, Survey, UInt8
 
@@ -196,9 +197,30 @@ def rewrite(source: SourceFile, move: Mover, path: Path) -> tuple[Path, ...]:
                 file=path,
                 remedy="Check the disk and run again.",
             )
+        require_lines(source.path, temporary, _line_rule(source, move), path)
     copies = copy_companions(source, path, but=".mtl" if source.copies else "")
     write_libraries(source, path)
     return (path, *copies)
+
+
+def _line_rule(source: SourceFile, move: Mover) -> LineRule:
+    """Return what a second reader expects of a line: `v` and `vn` moved, all else as it was."""
+
+    def rule(words: list[bytes], number: int) -> Expected | None:
+        del number
+        kind = words[0] if len(words) > 3 else b""
+        if words[:1] == [b"mtllib"] and source.copies:
+            return ANYTHING
+        if kind not in (b"v", b"vn"):
+            return None
+        try:
+            old = np.array([[float(word) for word in words[1:4]]])
+        except ValueError:
+            return ANYTHING
+        new = moved_points(move, old) if kind == b"v" else move.directions(old, old)
+        return Expected((1, 2, 3), new[0], 1e-6 + 1e-15 * np.abs(new[0]))
+
+    return rule
 
 
 def _read_back(path: Path) -> tuple[Float64, int]:

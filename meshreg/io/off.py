@@ -9,17 +9,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from meshreg.errors import InputError, UsageError
+from meshreg.errors import InputError, OutputError, UsageError
 from meshreg.io.assemble import Found, RawGeometry, assemble_survey, eight_bit_colors
 from meshreg.io.mover import Mover
 from meshreg.io.options import ReadOptions
 from meshreg.io.ply_text import line_of, read_numbers
 from meshreg.io.polygons import triangulate
-from meshreg.io.rewriting import Extent, moved_points, require_unchanged
-from meshreg.io.safe import atomic_file, file_bytes, require
+from meshreg.io.rewriting import Extent, moved_points, require_close, require_unchanged
+from meshreg.io.safe import atomic_file, file_bytes, open_regular, require
 from meshreg.io.sidecar import write_shift
 from meshreg.types import Float64, Frame, Mesh, SourceFile, Survey
 
+_MOST_READ_TWICE = 50_000_000  # bytes
 _COMMENT = re.compile(rb"#[^\r\n]*")
 _HEAD = re.compile(
     rb"\s*(C?OFF)\s+(-?[0-9]{1,15})[ \t]+(-?[0-9]{1,15})(?:[ \t]+-?[0-9]{1,15})?[ \t]*[\r\n]"
@@ -213,4 +214,33 @@ def rewrite(source: SourceFile, move: Mover, path: Path) -> tuple[Path, ...]:
         again = _Lines(temporary)
         tolerance = 1e-14 * float(np.abs(moved[np.isfinite(moved)]).max(initial=1))
         extent.require_equal(again.vertices.reshape(len(points), -1)[:, :3], path, tolerance)
+        _look_again(source.path, temporary, move, path)
     return (path,)
+
+
+def _look_again(old: Path, new: Path, move: Mover, path: Path) -> None:
+    """Compare vertices and faces as trimesh reads them, where the file is not large."""
+    from trimesh.exchange.off import load_off
+
+    if old.stat().st_size > _MOST_READ_TWICE:
+        return
+    tables = []
+    for each in (old, new):
+        with open_regular(each) as stream:
+            try:
+                tables.append(load_off(stream))
+            except (ValueError, IndexError, NameError) as error:
+                if each == old:
+                    return  # trimesh has never read it
+                raise OutputError(f"is not read by trimesh: {error}.", file=path) from error
+    before, after = tables
+    require_close(
+        after["vertices"], moved_points(move, before["vertices"]), _tolerance(after), path
+    )
+    if not np.array_equal(before["faces"], after["faces"]):
+        raise OutputError("does not read back as written: its faces differ.", file=path)
+
+
+def _tolerance(table: dict[str, Any]) -> float:
+    vertices = table["vertices"]
+    return 1e-13 * float(np.abs(vertices[np.isfinite(vertices)]).max(initial=1))

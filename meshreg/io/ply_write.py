@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -29,6 +29,7 @@ from meshreg.io.rewriting import (
     warn,
 )
 from meshreg.io.safe import atomic_file, file_bytes, resolve_reference
+from meshreg.io.second_reader import require_ply
 from meshreg.io.sidecar import write_shift
 from meshreg.types import Frame, Mesh, PointCloud, SourceFile, Survey
 
@@ -188,6 +189,7 @@ def rewrite(source: SourceFile, move: Mover, path: Path) -> tuple[Path, ...]:
                 here = end
             _copy(data, here, len(data), stream)
         _check(temporary, replace(header, textures=renamed), extent, path)
+        require_ply(source.path, temporary, _moved_values(move, turning["vertex"]), path)
     return (path, *copy_companions(source, path))
 
 
@@ -370,6 +372,19 @@ def _write_text(table: Table, text: bytes, moved: Any, stream: BinaryIO) -> None
                 line = b" ".join(row) + line[len(line.rstrip(b"\r\n")) :]
             stream.write(line)
     stream.writelines(lines)
+
+
+def _moved_values(move: Mover, found: Directions) -> Callable[[dict[str, float]], dict[str, float]]:
+    """Return the function that moves one vertex, for the second reader."""
+
+    def moved(values: dict[str, float]) -> dict[str, float]:
+        point = np.array([[values[name] for name in _XYZ]])
+        named = {name: np.array([values[name]]) for name in found.columns}
+        turned = turn_columns(found, move, point, named)
+        out = {name: float(column[0]) for name, column in turned.items()}
+        return out | dict(zip(_XYZ, moved_points(move, point)[0].tolist(), strict=True))
+
+    return moved
 
 
 def _check(written: Path, header: Header, extent: Extent, path: Path) -> None:

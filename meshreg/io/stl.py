@@ -6,6 +6,7 @@ An own reader, because the one number that must be checked (84 + 50 n bytes) is 
 from __future__ import annotations
 
 import re
+import struct
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,8 @@ from meshreg.io.rewriting import (
     require_unchanged,
     warn,
 )
-from meshreg.io.safe import atomic_file, file_bytes
+from meshreg.io.safe import atomic_file, file_bytes, open_regular
+from meshreg.io.second_reader import ANYTHING, Expected, require_lines, require_rows
 from meshreg.io.sidecar import write_shift
 from meshreg.types import Float64, Frame, Mesh, SourceFile, Survey, UInt8
 
@@ -214,7 +216,42 @@ def rewrite(source: SourceFile, move: Mover, path: Path) -> tuple[Path, ...]:
         else:
             tolerance = 1e-14 * float(np.abs(moved[np.isfinite(moved)]).max(initial=1))
             extent.require_equal(_text_corners(bytes(written), path), path, tolerance)
+        _look_again(source.path, temporary, move, binary, path)
     return (path,)
+
+
+def _look_again(old: Path, new: Path, move: Mover, binary: bool, path: Path) -> None:
+    """Compare facets by the second reader."""
+
+    def rule(words: list[bytes], number: int) -> Expected | None:
+        del number
+        kind = [word.lower() for word in words[:2]]
+        if kind[:1] == [b"vertex"] and len(words) == 4:
+            corner = np.array([[float(word) for word in words[1:]]])
+            values = moved_points(move, corner)[0]
+            return Expected((1, 2, 3), values, 1e-13 * (1 + np.abs(values)))
+        if kind == [b"facet", b"normal"] and len(words) == 5:
+            try:
+                vector = np.array([[float(word) for word in words[2:]]])
+            except ValueError:
+                return ANYTHING
+            return Expected((2, 3, 4), move.directions(vector, vector)[0], 1e-13)
+        return ANYTHING if len(words) > 5 else None  # a whole facet in one line
+
+    def facet(values: tuple[float, ...]) -> Expected:
+        normal, corners = np.array([values[:3]]), np.reshape(values[3:12], (3, 3))
+        new_normal = move.directions(corners[:1], normal)[0]
+        numbers = np.concatenate([new_normal, moved_points(move, corners).ravel()])
+        return Expected(range(12), numbers, 1e-37 + 1e-7 * np.abs(numbers))
+
+    if not binary:
+        require_lines(old, new, rule, path)
+        return
+    form = struct.Struct("<12fH")
+    with open_regular(old) as before, open_regular(new) as after:
+        before.seek(80)
+        (count,) = struct.unpack("<I", before.read(4))
+        require_rows(before, after, count, (form, form), (84, 84), facet, path)
 
 
 def _moved_text(text: bytes, move: Mover, corners: Float64) -> bytes:

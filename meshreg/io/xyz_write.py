@@ -16,6 +16,7 @@ from meshreg.io.directions import bend_note, turn_columns
 from meshreg.io.mover import Mover
 from meshreg.io.rewriting import Extent, moved_points, require_unchanged, warn
 from meshreg.io.safe import atomic_file, file_bytes
+from meshreg.io.second_reader import ANYTHING, Expected, LineRule, require_lines
 from meshreg.io.sidecar import find_sidecar, write_shift
 from meshreg.io.xyz_layout import Layout, read_layout
 from meshreg.io.xyz_values import columns_of
@@ -132,7 +133,43 @@ def rewrite(source: SourceFile, move: Mover, path: Path) -> tuple[Path, ...]:
         if again.columns != layout.columns or again.decimal != layout.decimal:
             raise OutputError("does not read back with the same columns.", file=path)
         _check(temporary, path, extent, 0.51e-4, replace(layout, start=again.start))
+        rule = _line_rule(layout, move, flip, least)
+        mark = None if layout.delimiter == " " else layout.delimiter.encode()
+        require_lines(source.path, temporary, rule, path, mark)
     return (path,)
+
+
+def _line_rule(layout: Layout, move: Mover, flip: bool, least: dict[int, int]) -> LineRule:
+    """Return what a second reader expects of a row; headers and comments do not matter to it."""
+    found = layout.directions
+    xyz = [layout.where[name] for name in _XYZ]
+
+    def rule(words: list[bytes], number: int) -> Expected | None:
+        del number
+        try:
+            numbers = {
+                column: float(words[column].replace(layout.decimal.encode(), b"."))
+                for column in least
+            }
+        except (ValueError, IndexError):
+            return ANYTHING
+        old = np.array([[numbers[column] for column in xyz]])
+        new = dict(zip(xyz, moved_points(move, old)[0], strict=True))
+        named = {name: np.array([numbers[layout.column(name)]]) for name in found.columns}
+        for name, value in turn_columns(found, move, old, named).items():
+            new[layout.column(name)] = float(value[0])
+        if flip:
+            new[xyz[2]] *= -1
+            for group in found.vectors:
+                new[layout.column(group[2])] *= -1
+        places = sorted(new)
+        digits = np.array([0.51 * 10.0 ** -least[column] for column in places])
+        values = np.array([new[column] for column in places])
+        if not np.isfinite(old).all():
+            values[:] = np.nan
+        return Expected(places, values, digits + 4e-16 * np.abs(values))
+
+    return rule
 
 
 def _renamed(head: bytes, names: dict[bytes, bytes]) -> bytes:
