@@ -34,6 +34,13 @@ tree = small_gicp.KdTree(small_gicp.PointCloud([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]
 assert tree.nearest_neighbor_search([0.9, 0.0, 0.0])[1] == 1
 print("small_gicp", m.version("small_gicp"))
 """
+_OPEN3D = """
+from meshreg.open3d_loading import load_open3d
+open3d = load_open3d()
+cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector([[0.0, 0, 0], [1.0, 0, 0]]))
+assert open3d.geometry.KDTreeFlann(cloud).search_knn_vector_3d([0.9, 0, 0], 1)[1][0] == 1
+print("Open3D", open3d.__version__)
+"""
 _OPENGL = """
 import pyvista
 plotter = pyvista.Plotter(off_screen=True, window_size=(64, 64))
@@ -114,8 +121,9 @@ def run_probe(code: str, *, seconds: float = 90.0) -> tuple[bool, str]:
 
 
 def has(what: str) -> tuple[bool, str]:
-    """Return whether the machine has "opengl", "small_gicp", "pye57" or "pycolmap", and why not."""
+    """Return whether the machine has "open3d", "opengl", ... and why not."""
     probes = {
+        "open3d": _OPEN3D,
         "small_gicp": _SMALL_GICP,
         "opengl": _OPENGL,
         "pye57": _PYE57,
@@ -238,6 +246,13 @@ def examine() -> tuple[Check, ...]:
             _SMALL_GICP,
             needed=False,
             remedy=_reinstall("small_gicp"),
+        ),
+        lambda: _probe(
+            "Open3D",
+            "refine.surfaces=icp",
+            _OPEN3D,
+            needed=False,
+            remedy="apt-get install libgl1 libegl1 libx11-6",
         ),
         lambda: _probe(
             "3-D rendering",

@@ -114,7 +114,8 @@ def register_pair(
         with clock.stage("surfaces"):
             place, ground = decision.heights.place, decision.heights.ground
             stable = None if ground is None else (ground == STABLE, pairs["dem"][1].grid)
-            said = polish(reference, moving, transform, place, error, stable, settings.seed)
+            kind, seed = settings.refine.surfaces, settings.seed
+            said = polish(reference, moving, transform, place, error, stable, seed, kind=kind)
         if said.accepted and covariance is not None:
             covariance = _after_polishing(covariance, transform, said)
             error = statistics.registration_error(

@@ -188,7 +188,11 @@ class RefineSettings(Checked):
     """From a cell to a millimetre (`meshreg.refine`, `heights`, `surfaces`)."""
 
     section: ClassVar[str] = "refine"
-    surfaces: str = choice("none", "gicp: a last step on the 3-D surfaces", ("none", "gicp"))
+    surfaces: str = choice(
+        "none",
+        "a last step on the 3-D surfaces: generalized or robust point-to-plane ICP",
+        ("none", "gicp", "icp"),
+    )
 
 
 @dataclass(frozen=True)

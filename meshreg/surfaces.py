@@ -1,18 +1,18 @@
-"""The last millimetres on the 3-D surfaces themselves: generalized ICP from the pose found.
+"""The last millimetres on the 3-D surfaces themselves: ICP from the pose found.
 
 A DEM sees a reef from above; its overhangs and walls, where much of the coral is, are seen only
-here. Opt-in (`refine.surfaces = "gicp"`), and believed only where it is a small step that makes the
-surfaces agree better. It looks at ground that has not changed, as the
-heights tell it, and is never surer than what it started from: a fit of points that lie close
-already does not see how the models bend.
+here. Opt-in (`refine.surfaces`), and believed only where it is a small step that makes the surfaces
+agree better. It looks at ground that has not changed, as the heights tell it, and is never surer
+than what it started from: a fit of points that lie close already does not see how the models bend.
 
-Generalized ICP (Segal, Haehnel and Thrun, RSS 2009) is small_gicp's, in one thread, so that the
-same points give the same answer.
+Generalized ICP ("gicp"; Segal, Haehnel and Thrun, RSS 2009) is small_gicp's, in one thread, so that
+the same points give the same answer. Point-to-plane ICP ("icp"; Chen and Medioni, 1992) with
+Tukey's robust kernel is Open3D's, which needs OpenGL's and X11's libraries.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -24,13 +24,12 @@ from meshreg.types import Bool, Float64, Grid, Maps, Mesh, Survey, Transform
 
 GATE = 0.03  # m: points further apart have changed, or are not the same surface
 MAX_POINTS = 1_000_000
-SURFACES = ("none", "gicp")
 BLOCKS = 7  # along the longer side: parcels of ground that err alike
 
 
 @dataclass(frozen=True, eq=False)
 class Polished:
-    """What generalized ICP says.
+    """What ICP on the surfaces says.
 
     Attributes
     ----------
@@ -80,13 +79,13 @@ class Polished:
 
 def check_surfaces(kind: str) -> None:
     """Raise UsageError for an unknown `refine.surfaces`."""
-    if kind not in SURFACES:
+    if kind != "none" and kind not in ALIGNERS:
         raise UsageError(
-            f"refine.surfaces is {kind!r}.", remedy=f"Use one of {', '.join(SURFACES)}."
+            f"refine.surfaces is {kind!r}.", remedy=f"Use one of none, {', '.join(ALIGNERS)}."
         )
 
 
-def polish(
+def polish(  # noqa: PLR0913, PLR0917
     reference: Survey,
     moving: Survey,
     transform: Transform,
@@ -95,11 +94,12 @@ def polish(
     stable: tuple[Bool, Grid] | None,
     seed: int = 0,
     max_points: int = MAX_POINTS,
+    kind: str = "gicp",
 ) -> Polished:
-    """Polish a registration by generalized ICP (Segal, Haehnel and Thrun 2009) on both surfaces.
+    """Polish a registration by ICP on both surfaces.
 
-    Points of both surveys (sampled over a mesh's area) are paired within 3 cm, with Tukey's
-    robust kernel over the same width, in an origin of their own.
+    Points of both surveys (sampled over a mesh's area) are paired within 3 cm, in an origin of
+    their own.
 
     Parameters
     ----------
@@ -118,6 +118,8 @@ def polish(
         Of the points' draw.
     max_points : int
         Of each survey.
+    kind : str
+        Key in `ALIGNERS`.
 
     Returns
     -------
@@ -128,11 +130,13 @@ def polish(
     Raises
     ------
     UsageError
-        If small_gicp cannot be imported.
+        If `kind` is unknown, or its library cannot be imported.
     """
     if isinstance(reference.geometry, Maps) or isinstance(moving.geometry, Maps):
         return _kept(transform, "maps have no 3-D surface to polish on")
-    gicp = _small_gicp()
+    check_surfaces(kind)
+    aligner = ALIGNERS[kind]
+    library = _library(kind, aligner.load)
     if stable is None:
         return _kept(transform, "too little stable ground to polish on")
     home = transform.apply(place)
@@ -144,22 +148,11 @@ def polish(
     loose = loose[trusted]
     if min(len(fixed), len(loose)) < 1000:
         return _kept(transform, "too few points in common to polish on")
-    clouds = [gicp.PointCloud(points) for points in (fixed, loose)]
-    for cloud in clouds:
-        gicp.estimate_normals_covariances(cloud, num_neighbors=20)
-    normals = clouds[0].normals()[:, :3]
+    clouds, normals = aligner.prepare(library, fixed, loose)
     before, share, _ = _agreement(fixed, normals, loose)
     if share < 0.1:
         return _kept(transform, "the surfaces lie too far apart to polish on")
-    found = gicp.align(
-        *clouds,
-        gicp.KdTree(clouds[0]),
-        max_correspondence_distance=GATE,
-        max_iterations=60,
-        rotation_epsilon=1e-7,
-        translation_epsilon=1e-7,
-    )
-    step = _proper(np.asarray(found.T_target_source))
+    step = _proper(aligner.align(library, *clouds))
     moved = np.abs(step.offset)
     after, share_after, scatter = _agreement(fixed, normals, step.apply(loose))
     sigma = np.array([error[axis] for axis in "xyz"]) if error else np.zeros(3)
@@ -267,12 +260,83 @@ def _kept(transform: Transform, why: str) -> Polished:
     return Polished(transform, False, 0.0, nan, nan, why)
 
 
-def _small_gicp() -> Any:
+def _library(kind: str, load: Callable[[], Any]) -> Any:
     try:
-        import small_gicp
+        return load()
     except (ImportError, OSError) as error:
         raise UsageError(
-            f"refine.surfaces is 'gicp', but small_gicp cannot be imported: {error}.",
+            f"refine.surfaces is {kind!r}, but its library cannot be imported: {error}.",
             remedy="Run `meshreg doctor` to see what is missing, or leave it at 'none'.",
         ) from error
+
+
+def _load_small_gicp() -> Any:
+    import small_gicp
+
     return small_gicp
+
+
+def _load_open3d() -> Any:
+    from meshreg.open3d_loading import load_open3d
+
+    return load_open3d()
+
+
+Clouds = tuple[tuple[Any, Any], Float64]  # reference and moving as the library has them; normals
+
+
+def _gicp_clouds(gicp: Any, fixed: Float64, loose: Float64) -> Clouds:
+    clouds = gicp.PointCloud(fixed), gicp.PointCloud(loose)
+    for cloud in clouds:
+        gicp.estimate_normals_covariances(cloud, num_neighbors=20)
+    return clouds, clouds[0].normals()[:, :3]
+
+
+def _by_gicp(gicp: Any, fixed: Any, loose: Any) -> Float64:
+    found = gicp.align(
+        fixed,
+        loose,
+        gicp.KdTree(fixed),
+        max_correspondence_distance=GATE,
+        max_iterations=60,
+        rotation_epsilon=1e-7,
+        translation_epsilon=1e-7,
+    )
+    return np.asarray(found.T_target_source, float)
+
+
+def _icp_clouds(o3d: Any, fixed: Float64, loose: Float64) -> Clouds:
+    clouds = tuple(
+        o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points)) for points in (fixed, loose)
+    )
+    clouds[0].estimate_normals(o3d.geometry.KDTreeSearchParamKNN(20))
+    return (clouds[0], clouds[1]), np.asarray(clouds[0].normals)
+
+
+def _by_icp(o3d: Any, fixed: Any, loose: Any) -> Float64:
+    pipeline = o3d.pipelines.registration
+    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+        found = pipeline.registration_icp(
+            loose,
+            fixed,
+            GATE,
+            np.eye(4),
+            pipeline.TransformationEstimationPointToPlane(pipeline.TukeyLoss(k=GATE)),
+            pipeline.ICPConvergenceCriteria(1e-9, 1e-9, 60),
+        )
+    return np.asarray(found.transformation, float)
+
+
+@dataclass(frozen=True)
+class Aligner:
+    """A library's way from two clouds to the (4, 4) step that lays the second on the first."""
+
+    load: Callable[[], Any]
+    prepare: Callable[[Any, Float64, Float64], Clouds]
+    align: Callable[[Any, Any, Any], Float64]
+
+
+ALIGNERS: Mapping[str, Aligner] = {
+    "gicp": Aligner(_load_small_gicp, _gicp_clouds, _by_gicp),
+    "icp": Aligner(_load_open3d, _icp_clouds, _by_icp),
+}

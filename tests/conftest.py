@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import os
-from pathlib import Path
 
 import pytest
 
@@ -16,12 +15,6 @@ os.environ.setdefault("MPLBACKEND", "Agg")
 
 @functools.cache
 def _has(what: str) -> tuple[bool, str]:
-    if what == "open3d":
-        here = Path(__file__).parent
-        return doctor.run_probe(
-            f"import sys; sys.path.insert(0, {str(here)!r})\n"
-            "from open3d_loading import load_open3d\nprint(load_open3d().__version__)"
-        )
     return doctor.has(what)
 
 

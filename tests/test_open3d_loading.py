@@ -1,4 +1,4 @@
-"""Open3D, the peer of some tests and benchmarks, loads with the libusb of a wheel."""
+"""Open3D loads with the libusb of a wheel."""
 
 from __future__ import annotations
 
@@ -8,9 +8,10 @@ import sys
 from pathlib import Path
 from types import SimpleNamespace
 
-import open3d_loading
 import pytest
-from open3d_loading import LIBUSB, load_libusb
+
+from meshreg import open3d_loading
+from meshreg.open3d_loading import LIBUSB, load_libusb
 
 ROOT = Path(__file__).parent.parent
 LINUX = pytest.mark.skipif(sys.platform != "linux", reason="elsewhere Open3D brings its own libusb")
@@ -21,8 +22,7 @@ LINUX = pytest.mark.skipif(sys.platform != "linux", reason="elsewhere Open3D bri
 def test_libusb_is_the_packages_also_where_the_system_has_one():
     """So the developers' machines and CI run what a machine without libusb runs."""
     code = (
-        "import sys; sys.path.insert(0, 'tests')\n"
-        "from open3d_loading import load_open3d\n"
+        "from meshreg.open3d_loading import load_open3d\n"
         "print(load_open3d().__version__)\n"
         "maps = [line.split()[-1] for line in open('/proc/self/maps') if 'libusb' in line]\n"
         "print(*sorted(set(maps)), sep='\\n')\n"

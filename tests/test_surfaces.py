@@ -75,14 +75,20 @@ def small_motion():
     return Transform(yaw @ tilt, 1.0, (0.007, -0.005, 0.006))
 
 
+ALIGNERS = ["gicp", pytest.param("icp", marks=pytest.mark.needs("open3d"))]
+
+
+@pytest.mark.parametrize("aligner", ALIGNERS)
 @pytest.mark.parametrize("kind", ["mesh", "cloud"])
-def test_a_small_motion_is_taken_back(kind):
+def test_a_small_motion_is_taken_back(kind, aligner):
     truth = small_motion()
     far = Transform(offset=(731_000.0, 5_705_000.0, -12.0))  # at UTM size, where float32 is blind
     reference = apply_transform(reef(seed=1, kind=kind), far)
     moving = apply_transform(reef(seed=2, kind=kind), far @ truth.inverse())
     stable = everywhere(*far.offset[:2])
-    found = polish(reference, moving, Transform(), far.offset, SIGMA, stable, max_points=25_000)
+    found = polish(
+        reference, moving, Transform(), far.offset, SIGMA, stable, max_points=25_000, kind=aligner
+    )
     assert found.accepted, found.note
     assert found.after < found.before
     assert found.moved == pytest.approx(np.linalg.norm(truth.offset), abs=0.002)
@@ -160,17 +166,18 @@ def test_maps_have_no_surface():
     assert "maps" in found.note
 
 
-def test_without_the_library_the_remedy_is_named(monkeypatch):
-    monkeypatch.setitem(sys.modules, "small_gicp", None)
+@pytest.mark.parametrize(("kind", "library"), [("gicp", "small_gicp"), ("icp", "open3d")])
+def test_without_the_library_the_remedy_is_named(monkeypatch, kind, library):
+    monkeypatch.setitem(sys.modules, library, None)
     cloud = Survey("cloud", PointCloud(np.random.default_rng(0).random((10, 3))))
     with pytest.raises(UsageError, match="meshreg doctor"):
-        polish(cloud, cloud, Transform(), np.zeros(3), SIGMA, None)
+        polish(cloud, cloud, Transform(), np.zeros(3), SIGMA, None, kind=kind)
 
 
 def test_unknown_surfaces_are_a_misuse():
     check_surfaces("none")
-    with pytest.raises(UsageError, match="'icp'"):
-        check_surfaces("icp")
+    with pytest.raises(UsageError, match="'ndt'"):
+        check_surfaces("ndt")
 
 
 def test_points_are_uniform_over_the_area():

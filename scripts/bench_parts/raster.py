@@ -13,8 +13,8 @@ from typing import Any
 
 import measure
 import numpy as np
-from open3d_loading import load_open3d
 
+from meshreg.open3d_loading import load_open3d
 from meshreg.raster import rasterize
 from meshreg.raster.mesh import draw_mesh
 from meshreg.raster.placing import place

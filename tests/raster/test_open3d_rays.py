@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from open3d_loading import load_open3d
 from reference_raster import several, sheet
 
+from meshreg.open3d_loading import load_open3d
 from meshreg.raster.mesh import draw_mesh
 from meshreg.raster.placing import place
 from meshreg.raster.spacing import Spacing

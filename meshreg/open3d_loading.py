@@ -1,10 +1,10 @@
-"""Open3D, against which tests and benchmarks compare; meshreg itself does without it.
+"""Open3D, loaded with the libusb of a wheel: the only way to it.
 
-Its wheel for Linux is linked against libusb (for RealSense cameras), OpenGL and X11, and brings
-none of them. The `libusb-package` wheel brings the one that most machines lack. Once a library of
-the same name is in the process the dynamic linker takes that one, so it is loaded first; before the
-system's own, so that every machine runs what the barest one runs. The others are the system's: a
-test that is marked `needs("open3d")` is skipped without them.
+Open3D's wheel for Linux is linked against libusb (for RealSense cameras), OpenGL and X11, and
+brings none of them. The `libusb-package` wheel brings the one that most machines lack. Once a
+library of the same name is in the process the dynamic linker takes that one, so it is loaded first;
+before the system's own, so that every machine runs what the barest one runs. OpenGL and X11 are the
+system's: `meshreg doctor` tells where they are missing.
 """
 
 from __future__ import annotations
