@@ -19,6 +19,7 @@ import typer
 
 from meshreg import __version__
 from meshreg.cli_parts.arguments import (
+    AllowSameOption,
     AxesOption,
     ConfigOption,
     DebugOption,
@@ -112,6 +113,7 @@ def register(
     ties: Annotated[
         str | None, typer.Option(metavar="FILE", help="Points picked by hand, one more method.")
     ] = None,
+    allow_same: AllowSameOption = False,
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
     debug: DebugOption = False,
@@ -160,6 +162,7 @@ def register(
         overwrite,
         ties,
         config,
+        allow_same,
     )
     registration = _done(
         as_json,
@@ -389,6 +392,7 @@ def selftest(
     scale: ScalesOption = None,
     positions: PositionsListOption = None,
     geometry_only: GeometryOnlyOption = False,
+    allow_same: AllowSameOption = False,
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
     debug: DebugOption = False,
@@ -419,6 +423,7 @@ def selftest(
         count,
         overwrite,
         config,
+        allow_same,
     )
     document = _done(
         as_json,
@@ -488,6 +493,7 @@ def pick(
     cell: Annotated[float | None, typer.Option(help="Cell of the pictures; from the data.")] = None,
     port: Annotated[int, typer.Option(min=0, max=65535, help="0 takes a free one.")] = 0,
     browser: Annotated[bool, typer.Option("--browser", help="Open the page there.")] = False,
+    allow_same: AllowSameOption = False,
     as_json: JsonOption = False,
     debug: DebugOption = False,
 ) -> int:
@@ -511,7 +517,14 @@ def pick(
         unit=unit,
     )
     request = picking.PickRequest(
-        surveys[0], surveys[1] if moving else None, ties, registration, cell, port, browser
+        surveys[0],
+        surveys[1] if moving else None,
+        ties,
+        registration,
+        cell,
+        port,
+        browser,
+        allow_same=allow_same,
     )
     picking.pick(request, _voice(as_json))
     return 0

@@ -197,6 +197,7 @@ def _in_frame(
             agree = judging.agree_distance(settings.judge, pairs["dem"][0].grid.cell)
             at = judgement.best.east, judgement.best.north
             refined = refine(used, at, judgement.best.sigma, agree, fields)
+            contradicted = _against_ties(estimates, refined, motion, settings)
             tear = _torn(used, refined.offset, fields)
             ground = dem_ground(*pairs["dem"], refined.offset)
             fitted, own = with_scale(refined, ground)
@@ -222,6 +223,7 @@ def _in_frame(
             tilt=float(np.rad2deg(np.hypot(*heights.tilt))),
             sigma_up=float(np.sqrt(max(heights.covariance[0, 0], 0.0))),
             relief=heights.relief,
+            ties=contradicted,
         )
         judgement = last_word(placed, findings(found))
     told = (notes, motion, scale, found)
@@ -255,6 +257,39 @@ def _supporting(
         if best.gaps[name] >= settings.judge.support_gap
     ]
     return used or [(*pairs["dem"], "terrain")]  # type: ignore[return-value]
+
+
+def _against_ties(
+    estimates: Sequence[OffsetEstimate],
+    refined: Refined,
+    motion: Transform | None,
+    settings: Settings,
+) -> str:
+    """Say by how much hand-picked points contradict the answer; '' where they do not."""
+    radius = settings.sift.inlier_radius
+    for estimate in estimates:
+        if not estimate.manual or estimate.status == "failed":
+            continue
+        used = np.asarray(estimate.evidence.get("inliers", ()), bool)
+        there = np.asarray(estimate.evidence.get("picked_reference", np.zeros((0, 2))))[used]
+        here = np.asarray(estimate.evidence.get("picked_moving", np.zeros((0, 2))))[used]
+        if not len(here):
+            continue
+        if motion is not None:
+            level = np.full((len(here), 1), motion.pivot[2])
+            here = motion.apply(np.hstack([here, level]))[:, :2]
+        arm = here - refined.pivot
+        turn = refined.yaw * np.stack([-arm[:, 1], arm[:, 0]], axis=1)
+        apart = there - (here + refined.offset + turn)
+        away = float(np.hypot(*apart.mean(axis=0)))
+        beyond = int((np.hypot(*apart.T) > radius).sum())
+        doubt = float(np.sqrt(np.trace(refined.covariance[:2, :2])))
+        if away > max(radius, 3 * doubt):
+            return (
+                f"the tie points lie {away:.2f} m from the answer on average "
+                f"({beyond} of {len(here)} further than {radius:g} m)"
+            )
+    return ""
 
 
 def _torn(

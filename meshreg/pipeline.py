@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 import platform
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -19,10 +19,11 @@ import numpy as np
 from meshreg import judge as judging
 from meshreg import statistics
 from meshreg.decision import Clock, Manual, Progress, completed, decide
-from meshreg.errors import UsageError
+from meshreg.errors import InputError, UsageError
 from meshreg.gain import Gain
 from meshreg.heading import Pairs, turning
 from meshreg.heights import STABLE, Heights, stable_ground
+from meshreg.layers import second_surface
 from meshreg.levels import lay_down, rasterize_pair
 from meshreg.offsets import ESTIMATORS, search_radius
 from meshreg.raster.grid import choose_cells
@@ -31,6 +32,7 @@ from meshreg.settings import Settings
 from meshreg.surfaces import Polished, check_surfaces, polish
 from meshreg.types import (
     Float64,
+    Layer,
     Maps,
     OffsetEstimate,
     Registration,
@@ -45,7 +47,7 @@ from meshreg.warp import Internal, check_model, measure
 from meshreg.warp_rasters import warped_raster
 
 
-def register_pair(
+def register_pair(  # noqa: PLR0913
     reference: Survey,
     moving: Survey,
     settings: Settings | None = None,
@@ -55,6 +57,7 @@ def register_pair(
     manual: Manual | None = None,
     progress: Progress | None = None,
     settled: Callable[[Transform], object] | None = None,
+    allow_same: bool = False,
 ) -> Registration:
     """Lay the moving (repeat) survey on the reference (original) one, and say how sure that is.
 
@@ -74,6 +77,9 @@ def register_pair(
         Called with the transform once it stands, before the surveys are laid down and compared, if
         that is all by which the moving survey will be moved: not where a warp is asked for.
 
+    allow_same : bool
+        Whether both surveys may come from the very same files.
+
     Returns
     -------
     Registration
@@ -83,8 +89,12 @@ def register_pair(
     ------
     UsageError
         If the surveys' CRS differ, or only one of them has a known scale.
+    InputError
+        If every file of both surveys is the same, and that is not allowed.
     """
     settings = settings or Settings()
+    if not allow_same:
+        require_different(reference, moving)
     settings, radius, notes = prepared(reference, moving, settings)
     tell = progress or (lambda stage, fraction: None)
     clock = Clock(tell)
@@ -129,6 +139,12 @@ def register_pair(
     with clock.stage("internal"):
         internal, rasters = _internal(refined, transform, rasters, settings)
     notes += [internal.said] if internal.said else []
+    layers = (
+        second_surface(reference, pairs["dem"][0], settings.seed),
+        second_surface(moving, pairs["dem"][1], settings.seed),
+    )
+    found = dataclasses.replace(found, layers=layers)
+    notes += _counted(layers)
     against = findings(found) if transform is not None else ()
     judgement = last_word(decision.placed, against)
     if judgement.verdict != "accepted":  # how far off it may be is not known
@@ -180,6 +196,16 @@ def register_pair(
     )
 
 
+def _counted(layers: Sequence[Layer | None]) -> list[str]:
+    """Say where a survey holds more than one surface in a share of its cells worth saying."""
+    return [
+        f"{layer.cells:.0%} of the {which} survey's cells hold more than one surface (overhangs, "
+        "plants, or points off the ground); the top one is compared"
+        for which, layer in zip(("reference", "moving"), layers, strict=True)
+        if layer is not None and layer.cells >= 0.01
+    ]
+
+
 def _gain(gain: Gain | None) -> dict[str, float] | None:
     """Return the gain of the heights for the record; None where no relief recurs."""
     if gain is None or not np.isfinite(gain.sigma):
@@ -203,6 +229,24 @@ def prepared(
         }
     )
     return settings, radius, list(cells.notes)
+
+
+def require_different(reference: Survey, moving: Survey) -> None:
+    """Refuse a survey that is compared with itself: a slip in a list of pairs, most often.
+
+    Raises
+    ------
+    InputError
+        If every file of both surveys has the same SHA-256, whatever their shifts.
+    """
+    if reference.checksums and reference.checksums == moving.checksums:
+        names = " and ".join(dict.fromkeys(s.source[0].path.name for s in (reference, moving)))
+        raise InputError(
+            f"Both surveys are the same file{'s' if len(reference.source) > 1 else ''} ({names}; "
+            "SHA-256), so that they can only lie on each other.",
+            remedy="Give the repeat survey's own files; --allow-same (in Python allow_same=True) "
+            "where a survey is to be compared with itself.",
+        )
 
 
 def _check(reference: Survey, moving: Survey, settings: Settings) -> None:

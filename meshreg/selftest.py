@@ -19,7 +19,7 @@ from meshreg.decision import Decision, completed, decide
 from meshreg.errors import UsageError
 from meshreg.heading import Pairs, turning
 from meshreg.levels import rasterize_pair
-from meshreg.pipeline import prepared, surveys_apart
+from meshreg.pipeline import prepared, require_different, surveys_apart
 from meshreg.settings import Settings
 from meshreg.types import Float64, Survey, Transform, Verdict
 from meshreg.voting import Turn
@@ -163,6 +163,7 @@ def self_test(
     reference_mask: Any = None,
     moving_mask: Any = None,
     progress: Progress | None = None,
+    allow_same: bool = False,
 ) -> SelfTest:
     """Put known shifts and turns into the moving survey and see how well they are recovered.
 
@@ -179,6 +180,9 @@ def self_test(
     progress : callable, optional
         Called with "rasterize" or "trials" and the fraction done.
 
+    allow_same : bool
+        Whether both surveys may come from the very same files.
+
     Returns
     -------
     SelfTest
@@ -189,9 +193,13 @@ def self_test(
     ------
     UsageError
         As `register_pair`, or if `count` is under 1.
+    InputError
+        As `register_pair`.
     """
     if count < 1:
         raise UsageError(f"A self-test of {count} shifts tests nothing.", remedy="Use 1 or more.")
+    if not allow_same:
+        require_different(reference, moving)
     settings, radius, _ = prepared(reference, moving, settings or Settings())
     tell = progress or (lambda stage, fraction: None)
     masks = {"reference": reference_mask, "moving": moving_mask}

@@ -334,6 +334,12 @@ class Survey:
     def __post_init__(self) -> None:
         _put(self, "origin", _frozen(self.origin, np.float64, (3,), "Survey.origin"))
 
+    @property
+    def checksums(self) -> frozenset[str]:
+        """SHA-256 of the files it came from; empty where that of one of them is not known."""
+        sums = frozenset(source.sha256 for source in self.source)
+        return frozenset() if "" in sums else sums
+
     @cached_property
     def bounds(self) -> Float64:
         """(2, 3) float64: lowest and highest absolute east, north, up [m]."""
@@ -639,6 +645,28 @@ class OffsetEstimate:
     def __post_init__(self) -> None:
         if self.sigma is not None:
             _put(self, "sigma", _frozen(self.sigma, np.float64, (2, 2), "OffsetEstimate.sigma"))
+
+
+@dataclass(frozen=True)
+class Layer:
+    """A second surface in a survey.
+
+    Attributes
+    ----------
+    cells : float
+        Share of the cells that hold a second surface.
+    common : float
+        Share of the cells whose second surface lies at the one offset that most share.
+    where_seen : float
+        The same, of the cells where a copy at that offset would stand off the first surface.
+    offset : (east, north, up)
+        That offset [m].
+    """
+
+    cells: float
+    common: float = 0.0
+    where_seen: float = 0.0
+    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)

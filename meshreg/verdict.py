@@ -16,13 +16,14 @@ import numpy as np
 from meshreg.gain import Gain
 from meshreg.judge import Judgement
 from meshreg.tears import Tear
-from meshreg.types import Finding
+from meshreg.types import Finding, Layer
 
 STEEPEST = 10.0  # degrees of tilt that may be applied
 WALL = 60.0  # degrees from which a survey cannot be looked at from above
 APART = 0.10  # m between the parts of a model that is torn
 SECOND_SURFACE = 0.10  # of the cells
 LEAST_UP = 0.14  # m: sigma of up, or the relief, below which neither is absurd
+WHERE_SEEN = 0.5  # of those where a copy could be seen, were it there
 FEET = 0.3048
 LEAST_STRETCH = 0.003  # a scale nearer to 1 than this is within what cameras and scale bars do
 # A scale that explains less than so many times what it leaves may be internal distortion; where it
@@ -51,25 +52,6 @@ class Stretch:
     moves: float
     ratio: float
     fitted: bool = False
-
-
-@dataclass(frozen=True)
-class Layer:
-    """A second surface in a survey.
-
-    Attributes
-    ----------
-    cells : float
-        Share of the cells that hold a second surface.
-    common : float
-        Share of the cells whose second surface lies at the one offset that most share.
-    offset : (east, north, up)
-        That offset [m].
-    """
-
-    cells: float
-    common: float = 0.0
-    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -178,11 +160,11 @@ def _stretched(found: Found) -> str:
 def _layered(found: Found) -> str:
     said = []
     for name, layer in zip(("reference", "moving"), found.layers, strict=True):
-        if layer is not None and layer.common >= SECOND_SURFACE:
+        if layer is not None and (layer.common >= SECOND_SURFACE or layer.where_seen >= WHERE_SEEN):
             east, north, up = layer.offset
             said.append(
-                f"the {name} survey holds a second copy of its surface in {layer.common:.0%} of "
-                f"its cells, ({east:+.2f}, {north:+.2f}, {up:+.2f}) m beside the first"
+                f"the {name} survey holds a second copy of its surface, seen in {layer.common:.0%} "
+                f"of its cells, about ({east:+.2f}, {north:+.2f}, {up:+.2f}) m beside the first"
             )
     return " and ".join(said)
 

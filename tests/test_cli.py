@@ -224,6 +224,12 @@ def test_same_file_twice_is_said(
 ) -> None:
     verdict("accepted")
     code, said, error = run("register", pair[0], pair[0], "-o", tmp_path / "out")
+    assert code == 3
+    assert "--allow-same" in error
+    assert not (tmp_path / "out").exists()
+    assert run("selftest", pair[0], pair[0])[0] == 3
+    command = ("register", pair[0], pair[0], "-o", tmp_path / "out", "--allow-same")
+    code, said, error = run(*command)
     assert code == 0
     assert "same file" in error
     assert "same file" in said

@@ -45,6 +45,7 @@ RULES: dict[str, set[str]] = {
     "warp": BASE | {"ladder", "tiles", "warp_rasters"},
     "statistics": BASE | {"raster", "offsets"},
     "offsets": BASE | {"jit", "kriging", "raster", "sandwich"},
+    "layers": BASE,
     "gain": BASE | {"dem_pair"},
     "tears": BASE | {"held_out", "tiles"},
     "verdict": BASE | {"gain", "judge", "tears"},
@@ -54,7 +55,7 @@ RULES: dict[str, set[str]] = {
     | {"heading", "heights", "held_out", "judge", "kriging", "offsets", "refine", "statistics"}
     | {"tears", "tiles", "verdict", "voting"},
     "pipeline": BASE
-    | {"decision", "gain", "heading", "heights", "judge", "levels", "offsets", "raster"}
+    | {"decision", "gain", "heading", "heights", "judge", "layers", "levels", "offsets", "raster"}
     | {"refine", "statistics", "surfaces", "voting", "verdict", "warp", "warp_rasters"},
     "ties": BASE | {"io", "raster", "offsets", "statistics", "report"},
     "doctor": set(),

@@ -77,6 +77,10 @@ GeometryOnlyOption = Annotated[
     bool,
     typer.Option("--geometry-only", help="Leave out textures, however broken they are."),
 ]
+AllowSameOption = Annotated[
+    bool,
+    typer.Option("--allow-same", help="Both surveys may be the very same files."),
+]
 MaskOption = Annotated[
     list[str] | None,
     typer.Option(

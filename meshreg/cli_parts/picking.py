@@ -36,6 +36,7 @@ class PickRequest:
     port: int = 0
     browser: bool = False
     settings: Settings = field(default_factory=Settings)
+    allow_same: bool = False
 
 
 def pick(request: PickRequest, voice: Voice) -> None:
@@ -124,6 +125,10 @@ def _desk_of_surveys(
     progress("read", 0.5)
     requests = (request.reference, moving_request)
     moving = read(moving_request, "moving")
+    if not request.allow_same:
+        from meshreg.pipeline import require_different
+
+        require_different(reference, moving)
     radius = request.settings.search.radius or 10.0
     moving, notes = pairing.same_frame(requests, (reference, moving), radius)
     moving, more = common_crs(reference, moving)

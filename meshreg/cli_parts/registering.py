@@ -53,6 +53,7 @@ class RegisterRequest:
     overwrite: bool = False
     ties: str | None = None
     config: Path | None = None  # the file that the settings came from
+    allow_same: bool = False
 
 
 def _new(request: RegisterRequest) -> NewFolder:
@@ -117,6 +118,7 @@ def register_into(folder: Path, request: RegisterRequest, progress: Progress) ->
             manual=manual,
             progress=progress,
             settled=settled,
+            allow_same=request.allow_same,
         )
         for survey in (reference, moving):
             unchanged(survey)
@@ -158,6 +160,10 @@ def _read_both(request: RegisterRequest, progress: Progress) -> tuple[Survey, Su
     moving = read(request.moving, "moving")
     if request.settings.warp.model != "none":
         require_warpable(moving)
+    if not request.allow_same:
+        from meshreg.pipeline import require_different
+
+        require_different(reference, moving)
     requests = (request.reference, request.moving)
     pairing.require_scale(requests, (reference, moving))
     radius = request.settings.search.radius or 10.0

@@ -41,6 +41,7 @@ class SelftestRequest:
     count: int = 8
     overwrite: bool = False
     config: Path | None = None
+    allow_same: bool = False
 
 
 def selftest(request: SelftestRequest, voice: Voice, unfinished: Unfinished) -> dict[str, Any]:
@@ -97,6 +98,7 @@ def _tested(request: SelftestRequest, progress: Progress) -> dict[str, Any]:
         reference_mask=masks["reference"],
         moving_mask=masks["moving"],
         progress=progress,
+        allow_same=request.allow_same,
     )
     return result.document()
 

@@ -106,18 +106,31 @@ def hand_registration(
     found = sift.ransac(offsets, options, np.random.default_rng(seed))
     if found is None:
         return None
-    inliers = found.inliers
+    (east, north), inliers = _last_fit(offsets, found.inliers, options.inlier_radius)
     return Hand(
-        found.east,
-        found.north,
+        east,
+        north,
         _spread(offsets[inliers], reference[inliers]),
         moving[inliers].mean(axis=0),
         inliers,
-        np.hypot(*(offsets - [found.east, found.north]).T),
+        np.hypot(*(offsets - [east, north]).T),
         sample,
         sift.draws(options),
         options.inlier_radius,
     )
+
+
+def _last_fit(offsets: Float64, inliers: Bool, radius: float) -> tuple[Float64, Bool]:
+    """Return the mean of the pairs that agree with that very mean, and which they are."""
+    for turn in range(100):
+        middle = offsets[inliers].mean(axis=0)
+        near = np.hypot(*(offsets - middle).T) <= radius
+        if turn > 10:  # in and out again: from here on none comes back
+            near &= inliers
+        if not near.any() or (near == inliers).all():
+            break
+        inliers = near
+    return middle, inliers
 
 
 def _spread(offsets: Float64, places: Float64) -> Float64:

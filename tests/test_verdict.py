@@ -1,0 +1,231 @@
+"""The last word: what each later stage may find, found in data that have it and not in others."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import seafloor
+from test_pipeline import QUICK, displaced, floors, survey
+
+from meshreg import Mesh, PointCloud, Survey, register_pair
+from meshreg.dem_pair import DemPair
+from meshreg.errors import InputError
+from meshreg.gain import Gain, relief_gain
+from meshreg.judge import Judgement
+from meshreg.layers import second_surface
+from meshreg.raster import rasterize
+from meshreg.tears import Tear, find_tear
+from meshreg.types import SourceFile, Transform
+from meshreg.verdict import Found, Stretch, findings, last_word
+
+
+def raised(one: Survey, times: float) -> Survey:
+    """The same survey with its heights multiplied."""
+    assert isinstance(one.geometry, Mesh)
+    points = one.geometry.vertices * [1.0, 1.0, times]
+    return dataclasses.replace(one, geometry=dataclasses.replace(one.geometry, vertices=points))
+
+
+@pytest.mark.parametrize(
+    ("times", "words"),
+    [(3.28084, "feet"), (1.5, "a vertical exaggeration of 1"), (1 / 1.33, "reference")],
+)
+def test_heights_in_another_unit_are_never_accepted(times, words):
+    first, later = floors()
+    reference = survey(first, half=5.0, seed=1)
+    moving, _ = displaced(raised(survey(later, half=5.0, seed=2), times))
+    found = register_pair(reference, moving, QUICK)
+    assert found.verdict == "review"
+    assert words in found.reason
+    assert "heights" in [finding.code for finding in found.findings]
+    assert found.heights_gain["value"] == pytest.approx(times, rel=0.05)
+    # an answer that is not proven states no error
+    assert found.covariance is None
+    assert found.registration_error is None
+
+
+@pytest.mark.parametrize("change", [0.0, 0.3, 0.6])
+def test_the_gain_is_one_where_ground_changes(change):
+    for seed in (0, 1, 2):
+        pair = seafloor.rasters(seed, offset=(0.0, 0.0), up=0.0, change=change)["dem"]
+        motion = Transform()
+        gain = relief_gain(DemPair.of(*pair, motion, None), motion)
+        assert not gain.departs
+        assert abs(np.log(gain.value)) < max(3 * gain.sigma, 0.05)
+
+
+@pytest.mark.parametrize("times", [0.7, 1.3, 2.0])
+def test_a_gain_is_recovered_with_its_error(times):
+    for seed in (0, 1):
+        still, moving = seafloor.rasters(seed, offset=(0.0, 0.0), up=0.0, change=0.2)["dem"]
+        moving = dataclasses.replace(moving, height=moving.height * np.float32(times))
+        motion = Transform()
+        gain = relief_gain(DemPair.of(still, moving, motion, None), motion)
+        assert gain.departs
+        assert abs(np.log(gain.value / times)) < 3 * gain.sigma < 0.3
+
+
+def bent(places, rng, size=0.1):
+    """A smooth bend of some `size` m rms, as wide as the patch."""
+    x, y = places.T / 12.0
+    waves = [np.sin(2 * np.pi * (a * x + b * y) + c) for a, b, c in rng.uniform(-0.4, 0.4, (4, 3))]
+    weights = rng.normal(0, size, (2, 4))
+    return (weights @ np.array(waves)).T
+
+
+def lattice(count=6, side=12.0):
+    axis = (np.arange(count) + 0.5) * side / count
+    return np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+
+
+@pytest.mark.parametrize("apart", [(0.34, 0.0), (-0.15, 0.2), (1.0, 0.4)])
+@pytest.mark.parametrize("split", ["half", "diagonal", "strip"])
+def test_a_torn_model_shows_two_populations(apart, split):
+    places = lattice()
+    x, y = places.T / 12.0
+    part = {"half": x > 0.5, "diagonal": x + y > 1.1, "strip": x < 0.3}[split]
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        values = bent(places, rng, 0.03) + rng.normal(0, 0.01, (36, 2))
+        values[part] += apart
+        values[rng.integers(36)] += [0.8, -0.5]  # ground that has changed
+        tear = find_tear(places, values, 0.005)
+        assert tear is not None
+        smaller = min(part.mean(), 1 - part.mean())
+        assert abs(tear.share - smaller) < 0.12
+        assert np.hypot(*(np.abs(tear.apart) - np.abs(apart))) < 0.1
+
+
+def test_a_smooth_bend_is_no_tear():
+    places = lattice()
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        values = bent(places, rng, rng.uniform(0, 0.25)) + rng.normal(0, 0.01, (36, 2))
+        tear = find_tear(places, values, 0.005)
+        assert tear is None or tear.size < 0.1
+    dome = ((places - 6.0) ** 2).sum(axis=1)[:, None] * 0.2 / 72
+    dome += np.random.default_rng(0).normal(0, 0.01, (36, 1))
+    assert find_tear(places, dome, 0.002) is None
+
+
+def test_half_a_model_that_slid_is_reviewed():
+    first, later = floors()
+    reference = survey(first, half=6.0, seed=1)
+    whole = survey(later, half=6.0, seed=2)
+    points = whole.geometry.vertices.copy()
+    points[points[:, 0] > 0.3] += [0.34, 0.0, 0.0]
+    torn = dataclasses.replace(whole, geometry=dataclasses.replace(whole.geometry, vertices=points))
+    found = register_pair(reference, displaced(torn)[0], QUICK)
+    assert found.verdict != "accepted"
+    tear = next(finding for finding in found.findings if finding.code == "tear")
+    assert "torn, or slid" in tear.said
+    assert "torn, or slid" in found.reason
+
+
+def doubled(points, step, share, rng):
+    """A cloud of which a share of the points lies aside."""
+    copy = rng.random(len(points)) < share
+    return np.concatenate([points[~copy], points[copy] + step])
+
+
+@pytest.mark.parametrize("step", [(0.25, 0, 0), (0, 0.25, 0.05), (0, 0, 0.1), (0, 0, -0.3)])
+@pytest.mark.parametrize("relief", [1.0, 0.4])
+def test_a_second_copy_of_the_surface_is_found(step, relief):
+    floor = seafloor.Seafloor.random(11, size=18.0, relief=relief)
+    points = survey(floor, half=5.0, cloud=True).geometry.points
+    ghost = Survey("ghost", PointCloud(doubled(points, step, 0.2, np.random.default_rng(0))))
+    layer = second_surface(ghost, rasterize(ghost, survey_lattice(ghost)))
+    found = Found(layers=(layer, None))
+    assert [finding.code for finding in findings(found)] == ["layers"]
+    # the DEM is the mean of both, so that what is left of the step is at least 70 % of it
+    told = np.array(layer.offset)
+    assert np.linalg.norm(told - step) < 0.4 * np.linalg.norm(step)
+
+
+def survey_lattice(one, cell=0.1):
+    from meshreg.raster.grid import survey_grid
+
+    return survey_grid(one, cell)
+
+
+def test_overhangs_and_plants_are_counted_and_not_reviewed():
+    rng = np.random.default_rng(1)
+    floor = seafloor.Seafloor.random(11, size=18.0)
+    points = survey(floor, half=5.0, cloud=True).geometry.points
+    chosen = rng.random(len(points)) < 0.1
+    plants = points[chosen] + np.column_stack(
+        [rng.normal(0, 0.05, (chosen.sum(), 2)), rng.uniform(0.05, 0.4, chosen.sum())]
+    )
+    tables = [points]
+    for _ in range(30):
+        middle, size, angle = rng.uniform(-4, 4, 2), rng.uniform(0.2, 0.6), rng.uniform(0, 7, 600)
+        away = size * np.sqrt(rng.random(600))
+        base = points[np.argmin(((points[:, :2] - middle) ** 2).sum(axis=1)), 2]
+        level = np.full(600, base + rng.uniform(0.15, 0.4))
+        tables.append(
+            np.column_stack([middle + away[:, None] * np.c_[np.cos(angle), np.sin(angle)], level])
+        )
+    for scene in (points, np.concatenate([points, plants]), np.concatenate(tables)):
+        one = Survey("scene", PointCloud(scene))
+        layer = second_surface(one, rasterize(one, survey_lattice(one)))
+        assert layer is not None
+        assert (layer.cells > 0.03) == (scene is not points)
+        assert not findings(Found(layers=(None, layer)))
+
+
+PLACED = Judgement("accepted", "terrain and image agree", None)
+
+
+@pytest.mark.parametrize(
+    ("found", "code"),
+    [
+        (Found(stretch=Stretch(1.0199, 0.001, 5.7, 7.0)), "scale"),
+        (Found(stretch=Stretch(0.99, 0.001, 2.8, 2.0)), "scale"),
+        (Found(gain=Gain(3.28, 0.02, True)), "heights"),
+        (Found(tilt=12.0), "lean"),
+        (Found(dips=(80.0, 81.0)), "upright"),
+        (Found(dips=(4.0, 81.0)), "lean"),
+        (Found(tear=Tear(np.array([0.34, 0.0]), 0.01, 0.5, "east")), "tear"),
+        (Found(step=Tear(np.array([-0.2]), 0.01, 0.3, "north")), "tear"),
+        (Found(sigma_up=0.94, relief=0.6), "up"),
+        (Found(ties="the tie points lie 0.73 m from the answer"), "ties"),
+    ],
+)
+def test_each_finding_reaches_the_verdict(found, code):
+    against = findings(found)
+    assert [finding.code for finding in against] == [code]
+    judged = last_word(PLACED, against)
+    assert judged.verdict == "review"
+    assert against[0].said in judged.reason
+    rejected = dataclasses.replace(PLACED, verdict="rejected")
+    assert last_word(rejected, against).verdict == "rejected"
+
+
+@pytest.mark.parametrize(
+    "found",
+    [
+        Found(),
+        Found(stretch=Stretch(0.98, 0.0005, 0.15, 1.2)),  # internal distortion on a small plot
+        Found(stretch=Stretch(1.0199, 0.001, 5.7, 7.0, fitted=True)),
+        Found(gain=Gain(1.3, 0.2, False), tilt=2.0, dips=(50.0, 48.0)),
+        Found(tear=Tear(np.array([0.06, 0.0]), 0.01, 0.4, "west")),
+        Found(sigma_up=0.08, relief=0.04),  # flat sand
+    ],
+)
+def test_what_is_within_reason_stays_accepted(found):
+    assert findings(found) == ()
+    assert last_word(PLACED, ()) == PLACED
+
+
+def test_the_same_files_are_refused_unless_allowed(tmp_path):
+    one = survey(floors()[0], half=3.0, step=0.08)
+    files = (SourceFile(tmp_path / "a.ply", "ply", sha256="ab" * 32),)
+    same = dataclasses.replace(one, source=files)
+    with pytest.raises(InputError, match="same file"):
+        register_pair(same, dataclasses.replace(same, origin=np.array([5.0, 0, 0])), QUICK)
+    other = (*files, SourceFile(tmp_path / "b.ply", "ply", sha256="cd" * 32))
+    for moving in (dataclasses.replace(same, source=other), one):
+        assert register_pair(same, moving, QUICK).verdict == "accepted"
+    assert register_pair(same, same, QUICK, allow_same=True).verdict == "accepted"
