@@ -241,7 +241,7 @@ def channel_map(
         surface, counts = neutral.surface(
             transformed[window.padded], changed, correlator, min_overlap
         )
-        exclusion = max(0.5, 5 * window.cell)
+        exclusion = window.exclusion(5)
         for east, north in apart:
             away = np.hypot(window.east[None, :] - east, window.north[:, None] - north)
             surface[away < 3 * exclusion] = np.nan
@@ -447,7 +447,8 @@ def _false_alarm(
             continue
         alarm *= channel.false_alarm(gap)
         if not first:
-            alarm *= min(1.0, math.pi * reach**2 / (2 * radius) ** 2)
+            area = min((2 * radius) ** 2, channel.window.area)
+            alarm *= min(1.0, math.pi * reach**2 / max(area, 1e-12))
         first = False
     return alarm
 

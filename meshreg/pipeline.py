@@ -277,9 +277,14 @@ def surveys_apart(reference: Survey, moving: Survey, radius: float) -> str:
     away = float(gaps.max())
     if away <= radius:
         return ""
+    # as far as brings the whole of the smaller one on the other, and a tenth
+    whole = away + float(np.minimum(np.ptp(a[:, :2], axis=0), np.ptp(b[:, :2], axis=0)).max())
+    power = 10.0 ** np.floor(np.log10(1.1 * whole))
+    further = 0.5 * power * np.ceil(2.2 * whole / power)
     return (
         f"the surveys lie {away:.4g} m apart, beyond the search radius of {radius:g} m; check "
-        "their shifts (--reference-shift, --moving-shift) and CRS"
+        "their shifts (--reference-shift, --moving-shift) and CRS, or search further "
+        f"(--search-radius {further:g})"
     )
 
 

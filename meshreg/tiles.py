@@ -17,6 +17,7 @@ import numpy as np
 from meshreg.offsets import correlate, neutral
 from meshreg.offsets.channels import high_pass
 from meshreg.offsets.correlate import Correlator, Window
+from meshreg.offsets.error_bars import whole_shift
 from meshreg.offsets.surface import find_peak
 from meshreg.types import Bool, Float64, Grid, OffsetAt, SurveyRaster
 
@@ -72,9 +73,8 @@ class Overlap:
     def at(cls, reference: Grid, moving: Grid, offset: tuple[float, float]) -> Overlap:
         """Return the overlap at the whole-cell offset nearest to `offset`."""
         cell = moving.cell
-        nominal = Window.around(reference, moving, cell)
         steps = round(offset[1] / cell), round(offset[0] / cell)
-        row, col = int(nominal.rows[1]) - steps[0], int(nominal.cols[1]) + steps[1]
+        row, col = whole_shift((reference, moving), (steps[1] * cell, steps[0] * cell))
         rows = max(0, -row), min(moving.shape[0], reference.shape[0] - row)
         cols = max(0, -col), min(moving.shape[1], reference.shape[1] - col)
         return cls(rows, cols, (row, col), (steps[1] * cell, steps[0] * cell))

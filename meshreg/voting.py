@@ -19,6 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from meshreg.offsets.correlate import Window
 from meshreg.offsets.surface import MAD_TO_SIGMA
 from meshreg.settings import SearchSettings
 from meshreg.tile_surfaces import (
@@ -134,6 +135,8 @@ def vote(pairs: Mapping[str, Pair], settings: SearchSettings, radius: float) -> 
     max_yaw, max_scale = float(np.deg2rad(settings.max_yaw)), settings.max_scale
     if max_yaw <= 0 and max_scale <= 0:
         return None
+    delivered = pairs
+    pairs, moved, radius = _laid_together(pairs, radius)
     trials, best = 0, None
     for cell in _voting_cells(pairs):
         turn = _best_at(pairs, cell, radius, max_yaw, max_scale)
@@ -148,10 +151,38 @@ def vote(pairs: Mapping[str, Pair], settings: SearchSettings, radius: float) -> 
             break
     if best is None or best.gap < WORTH_A_LOOK:
         return None
-    best = replace(best, trials=trials)
+    centre = best.centre[0] - moved[0], best.centre[1] - moved[1]
+    offset = best.offset[0] + moved[0], best.offset[1] + moved[1]
+    best = replace(best, trials=trials, centre=centre, offset=offset)
+    pairs = delivered
     if abs(best.yaw) <= SMALL_YAW and abs(best.stretch - 1) >= FINE_SCALE:
         best = settled(pairs, best, best.offset_at)
     return scaled(best, settings)
+
+
+def _laid_together(
+    pairs: Mapping[str, Pair], radius: float
+) -> tuple[Mapping[str, Pair], tuple[float, float], float]:
+    """Lay the moving survey amid the offsets at which it meets the reference, if these are few.
+
+    Returns the pairs, the shift [m east, north] and the radius [m] about it.
+    """
+    reference, moving = (raster.grid for raster in pairs["dem"])
+    window = Window.around(reference, moving, radius)
+    if window.empty:
+        return pairs, (0.0, 0.0), radius
+    half = 0.5 * max(float(np.ptp(window.east)), float(np.ptp(window.north)))
+    if half > 0.9 * radius:
+        return pairs, (0.0, 0.0), radius
+    cell = moving.cell
+    east, north = (
+        cell * round(0.5 * float(axis[0] + axis[-1]) / cell) for axis in (window.east, window.north)
+    )
+    laid = {}
+    for name, (still, raster) in pairs.items():
+        grid = replace(raster.grid, west=raster.grid.west + east, north=raster.grid.north + north)
+        laid[name] = still, replace(raster, grid=grid)
+    return laid, (east, north), half + cell
 
 
 def scaled(turn: Turn, settings: SearchSettings) -> Turn:

@@ -170,11 +170,15 @@ def _exhaustive(
     smaller = min(counts.max(), *(int(_mask(r, method).sum()) for r in (reference, moving)))
     overlap = float(counts[peak.index]) / max(float(smaller), 1.0)
     if peak.border:
-        reach = float(window.east[-1])
-        reason = (
-            f"search border: the best offset ({peak.east:.2f}, {peak.north:.2f}) m is at the edge "
-            f"of what could be searched (±{reach:g} m); try a larger --search-radius"
-        )
+        radius = search_radius(settings, reference.grid.cell)
+        where = f"the best offset ({peak.east:.2f}, {peak.north:.2f}) m is at the edge of "
+        if max(abs(peak.east), abs(peak.north)) > radius - 2 * window.cell:
+            reason = (
+                f"search border: {where}what could be searched (±{radius:g} m); try a larger "
+                "--search-radius"
+            )
+        else:
+            reason = f"{where}where the surveys overlap at all"
         return failed(method, reason, evidence)
     weak = peak.gap < 1.0
     return OffsetEstimate(

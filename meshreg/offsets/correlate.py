@@ -52,6 +52,9 @@ class Window:
     def around(cls, reference: Grid, moving: Grid, radius: float) -> Window:
         """Return all offsets of up to `radius` metres east or north, on the grids' lattice.
 
+        Those at which the rasters have no cell in common are left out: a small plot costs as much
+        as its own size asks, however far one looks for it.
+
         Raises
         ------
         UsageError
@@ -72,23 +75,38 @@ class Window:
                 remedy="Snap both to one lattice (meshreg.raster.survey_grid).",
             )
         reach = max(1, int(np.floor(radius / cell + 1e-6)))
-        steps = np.arange(-reach, reach + 1)
+        down, across = (
+            np.arange(max(-reach, 1 - there - nominal), min(reach, here - 1 - nominal) + 1)
+            for nominal, here, there in zip(
+                (round(row), round(col)), reference.shape, moving.shape, strict=True
+            )
+        )
         return cls(
             cell,
-            steps + round(row),
-            steps + round(col),
-            np.asarray(steps * cell, np.float64),
-            np.asarray(-steps * cell, np.float64),
+            down + round(row),
+            across + round(col),
+            np.asarray(across * cell, np.float64),
+            np.asarray(-down * cell, np.float64),
             (reference.shape, moving.shape),
         )
 
     @property
     def empty(self) -> bool:
         """Whether the rasters do not overlap at any offset of the window."""
-        for axis, shifts in enumerate((self.rows, self.cols)):
-            if shifts[0] >= self.shapes[0][axis] or shifts[-1] <= -self.shapes[1][axis]:
-                return True
-        return False
+        return not (len(self.rows) and len(self.cols))
+
+    def exclusion(self, cells: float) -> float:
+        """Return how far from a peak [m] its rivals begin.
+
+        Half a metre, or so many cells where those are coarse; a tenth of a small plot's window.
+        """
+        wide = float(max(np.ptp(self.east), np.ptp(self.north)))
+        return max(min(0.5, 0.1 * wide), cells * self.cell)
+
+    @property
+    def area(self) -> float:
+        """Area of the offsets that are searched [m²]."""
+        return float(np.ptp(self.east) * np.ptp(self.north))
 
     @cached_property
     def padded(self) -> tuple[int, int]:
@@ -98,7 +116,9 @@ class Window:
         sizes = []
         for axis, shifts in enumerate((self.rows, self.cols)):
             n_reference, n_moving = self.shapes[0][axis], self.shapes[1][axis]
-            need = max(n_reference, n_moving, n_reference - shifts[0], n_moving + shifts[-1])
+            need = max(n_reference, n_moving)
+            if len(shifts):
+                need = max(need, n_reference - shifts[0], n_moving + shifts[-1])
             # axis 1 is the real transform's, which likes its own sizes
             sizes.append(int(next_fast_len(int(need), real=axis == 1)))
         return sizes[0], sizes[1]

@@ -42,7 +42,7 @@ def scan(
     else:
         surface, counts = fft_surface(first, second, masks, window, share, options.bins)
         quality = without_small_sample_bias(surface, counts) * counts
-    peak = find_peak(quality, window.east, window.north, exclusion=max(0.5, 3 * window.cell))
+    peak = find_peak(quality, window.east, window.north, exclusion=window.exclusion(3))
     pairs = partial(_asked, reference, moving, (first, second), options)
     evidence = {"surface": surface, "lower_is_better": False, "counts": counts, "pairs": pairs}
     return peak, float(surface[peak.index]) if peak else float("nan"), evidence

@@ -43,7 +43,7 @@ def scan(
     else:
         surface, counts = cost_surface(reference, moving, window, share)
         quality = -surface
-    peak = find_peak(quality, window.east, window.north, exclusion=max(0.5, 3 * window.cell))
+    peak = find_peak(quality, window.east, window.north, exclusion=window.exclusion(3))
     scales = settings.terrain.high_pass or TerrainSettings().high_pass
     evidence = {
         "pairs": lambda _: block_fields(reference, moving, scales),

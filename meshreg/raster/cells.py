@@ -37,10 +37,10 @@ def choose_cells(
     """Choose the cells for a pair: what the settings say, else what the data can bear.
 
     The DEM's cell is the paper's 0.10 m, but not finer than the points (three times the spacing
-    of a cloud's points, so that the orthomosaic's cells of half the size hold two points each) or
-    the texels; and finer where the patch is under 5 m across (50 cells at least) or its points are
-    under 2 mm apart. It has one digit. The orthomosaic has half that cell,
-    or the same where the texels are no finer.
+    of a cloud's scattered points, so that the orthomosaic's cells of half the size hold two points
+    each; a gridded cloud is as good as the map that it was made from) or the texels; and finer
+    where the patch is under 5 m across (50 cells at least) or its points are under 2 mm apart. It
+    has one digit. The orthomosaic has half that cell, or the same where the texels are no finer.
     SIFT works at the coarser texture's spacing, but not finer than 0.02 m (on ground under 20 m
     across: than a thousandth of it, and not than 0.01 m) and not coarser than the orthomosaic, and
     coarsens where its raster would have over a quarter of `settings.max_cells`.
@@ -95,7 +95,7 @@ def _default_dem_cell(pair: list[tuple[Survey, Spacing]], notes: list[str]) -> f
 
 def _finest(survey: Survey, spacing: Spacing) -> tuple[float, str]:
     """Finest DEM cell [m] that a survey bears, and what says so."""
-    if isinstance(survey.geometry, PointCloud):
+    if isinstance(survey.geometry, PointCloud) and not spacing.gridded:
         return 3.0 * spacing.points, f"points {spacing.points:.3g} m apart"
     texels = spacing.texels or 0.0
     if texels > spacing.points:
@@ -113,7 +113,7 @@ def _default_sift_cell(
     # finer images than these show more features than are kept (sift.max_features)
     finest = float(np.clip(math.sqrt(area) / 1000, FINEST_SMALL_CELL, FINEST_SIFT_CELL))
     for survey, spacing in pair:
-        cloud = isinstance(survey.geometry, PointCloud)
+        cloud = isinstance(survey.geometry, PointCloud) and not spacing.gridded
         finest = max(finest, 1.5 * spacing.points if cloud else spacing.texels or spacing.points)
     times = max(1, math.floor(ortho / finest + 0.01))
     most = max(1, math.floor(ortho * math.sqrt(0.25 * settings.max_cells / area)))

@@ -23,10 +23,13 @@ class Spacing:
         Between neighbouring vertices, points or height cells [m].
     texels : float or None
         Between neighbouring texels [m]; None without a texture or an orthomosaic.
+    gridded : bool
+        Whether a cloud's points stand on a regular grid, one in each of its squares.
     """
 
     points: float
     texels: float | None
+    gridded: bool = False
 
 
 _MEASURED: WeakKeyDictionary[Survey, Spacing] = WeakKeyDictionary()  # asked for seven times a pair
@@ -66,7 +69,8 @@ def _measured(survey: Survey) -> Spacing:
             file=survey.source[0].path if survey.source else None,
             remedy="Check the file, or which axis points up (--up, --axes).",
         )
-    return Spacing(points, texels)
+    gridded = isinstance(geometry, PointCloud) and _on_a_grid(geometry.points, points)
+    return Spacing(points, texels, gridded)
 
 
 def _edge(mesh: Mesh) -> float | None:
@@ -135,6 +139,29 @@ def _cloud_spacing(points: Float64) -> float | None:
         area = len(np.unique(cells[:, 1] * cols + cells[:, 0])) * square**2
         square = 5.0 * np.sqrt(area / len(sample))
     return float(np.sqrt(area / len(points)))
+
+
+def _on_a_grid(points: Float64, spacing: float) -> bool:
+    """Whether each point's nearest neighbour is as far as any other's: about one `spacing` [m].
+
+    Scattered points have theirs at half of that on average, at any distance from nothing to more.
+    Looked at in full around three points.
+    """
+    from scipy.spatial import cKDTree
+
+    told = []
+    for place in (0.25, 0.5, 0.75):
+        middle = points[int(place * (len(points) - 1)), :2]
+        near = (np.abs(points[:, 0] - middle[0]) < 10 * spacing) & (
+            np.abs(points[:, 1] - middle[1]) < 10 * spacing
+        )
+        part = points[near, :2]
+        if len(part) < 30:
+            continue
+        nearest = cKDTree(part).query(part, 2)[0][:, 1]
+        low, middling, high = np.quantile(nearest, (0.1, 0.5, 0.9))
+        told.append(high - low < 0.2 * middling and 0.8 < middling / spacing < 1.2)
+    return bool(told) and all(told)
 
 
 def survey_bounds(survey: Survey, transform: Transform | None = None) -> Float64:

@@ -160,3 +160,27 @@ def test_grids_off_the_lattice_are_refused():
         Window.around(a, dataclasses.replace(a, west=0.03), 0.5)
     with pytest.raises(UsageError, match=r"cells differ: 0\.1 and 0\.2"):
         Window.around(a, dataclasses.replace(a, cell=0.2), 0.5)
+
+
+@given(
+    shapes=st.tuples(*[st.tuples(st.integers(3, 9), st.integers(3, 9))] * 2),
+    place=st.tuples(st.integers(-40, 40), st.integers(-40, 40)),
+    reach=st.integers(1, 50),
+)
+def test_a_window_holds_the_offsets_at_which_the_rasters_meet_and_no_others(shapes, place, reach):
+    a = Grid(0.0, 0.0, 1.0, shapes[0])
+    b = Grid(float(place[0]), float(place[1]), 1.0, shapes[1])
+    window = Window.around(a, b, reach)
+    for axis, (nominal, shifts) in enumerate(
+        zip((-place[1], place[0]), (window.rows, window.cols), strict=True)
+    ):
+        cells = set(range(shapes[0][axis]))
+        meet = [
+            s
+            for s in range(nominal - reach, nominal + reach + 1)
+            if cells & set(range(s, s + shapes[1][axis]))
+        ]
+        assert list(shifts) == meet
+    assert window.empty == (not (len(window.rows) and len(window.cols)))
+    # the search costs what the rasters' own sizes ask, however far it goes
+    assert max(window.padded) <= 2 * (sum(map(max, shapes)) + 2)

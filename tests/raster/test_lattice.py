@@ -6,6 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+import scipy.spatial  # noqa: F401  (its loading is no part of an example's time)
 from hypothesis import given
 from hypothesis import strategies as st
 from reference_raster import block_mean, draped, moved, sheet
@@ -357,3 +358,32 @@ def test_averaging_a_fine_raster_is_rasterizing_at_the_coarse_cell():
     inner = both & (direct.samples == direct.samples.max())
     assert np.abs(coarse.height - direct.height)[inner].max() < 5e-3  # 10 × 10 or 5 × 5 samples
     assert (coarse.valid != direct.valid).mean() < 0.05
+
+
+@pytest.mark.parametrize("turn", [0.0, 7.0, 31.0])
+@pytest.mark.parametrize("phase", [(0.0, 0.0), (0.3, 0.7), (0.5, 0.5)])
+def test_a_gridded_cloud_gets_the_cell_of_the_map_that_it_was_made_from(turn, phase):
+    from meshreg.raster import rasterize
+
+    step, count = 1.0024, 120
+    place = step * (np.stack(np.mgrid[0:count, 0:count], -1).reshape(-1, 2) + phase)
+    c, s = np.cos(np.deg2rad(turn)), np.sin(np.deg2rad(turn))
+    points = np.column_stack([place @ [[c, s], [-s, c]], np.sin(place[:, 0])])
+    known = np.hypot(*(place - 60).T) < 50  # an edge like a survey's
+    gridded = Survey("gridded", PointCloud(points[known]))
+    assert measure_spacing(gridded).gridded
+    made = choose_cells(gridded, gridded)
+    assert (made.dem, made.ortho) == (1.0, 1.0)
+    # no hole wider than what rasterizing closes: almost every cell inside has a height
+    raster = rasterize(gridded, survey_grid(gridded, made.dem))
+    middle = points[known].mean(axis=0)
+    rows, cols = np.indices(raster.valid.shape)
+    east, north = raster.grid.east_north(rows, cols)
+    inner = np.hypot(east - middle[0], north - middle[1]) < 40
+    assert raster.valid[inner].mean() > 0.99
+
+
+def test_scattered_points_keep_three_spacings():
+    scattered = cloud(1.0, size=100, seed=3)
+    assert not measure_spacing(scattered).gridded
+    assert choose_cells(scattered, scattered).dem == 3.0
