@@ -218,7 +218,7 @@ def _line_rule(source: SourceFile, move: Mover) -> LineRule:
         except ValueError:
             return ANYTHING
         new = moved_points(move, old) if kind == b"v" else move.directions(old, old)
-        return Expected((1, 2, 3), new[0], 1e-6 + 1e-15 * np.abs(new[0]))
+        return Expected((1, 2, 3), new[0], 1e-6 + 2e-15 * np.abs(new[0]))
 
     return rule
 

@@ -15,8 +15,15 @@ from meshreg.io.mover import Mover
 from meshreg.io.options import ReadOptions
 from meshreg.io.ply_text import line_of, read_numbers
 from meshreg.io.polygons import triangulate
-from meshreg.io.rewriting import Extent, moved_points, require_close, require_unchanged
+from meshreg.io.rewriting import (
+    Extent,
+    metres_per_file_unit,
+    moved_points,
+    require_close,
+    require_unchanged,
+)
 from meshreg.io.safe import atomic_file, file_bytes, open_regular, require
+from meshreg.io.second_reader import SLACK
 from meshreg.io.sidecar import write_shift
 from meshreg.types import Float64, Frame, Mesh, SourceFile, Survey
 
@@ -234,13 +241,9 @@ def _look_again(old: Path, new: Path, move: Mover, path: Path) -> None:
                     return  # trimesh has never read it
                 raise OutputError(f"is not read by trimesh: {error}.", file=path) from error
     before, after = tables
-    require_close(
-        after["vertices"], moved_points(move, before["vertices"]), _tolerance(after), path
-    )
+    expected = moved_points(move, before["vertices"])
+    tolerance = SLACK / metres_per_file_unit(move)
+    tolerance += 1e-13 * float(np.abs(expected[np.isfinite(expected)]).max(initial=1))
+    require_close(after["vertices"], expected, tolerance, path)
     if not np.array_equal(before["faces"], after["faces"]):
         raise OutputError("does not read back as written: its faces differ.", file=path)
-
-
-def _tolerance(table: dict[str, Any]) -> float:
-    vertices = table["vertices"]
-    return 1e-13 * float(np.abs(vertices[np.isfinite(vertices)]).max(initial=1))

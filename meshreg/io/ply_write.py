@@ -24,12 +24,13 @@ from meshreg.io.rewriting import (
     Extent,
     copy_companions,
     float32_step,
+    metres_per_file_unit,
     moved_points,
     require_unchanged,
     warn,
 )
 from meshreg.io.safe import atomic_file, file_bytes, resolve_reference
-from meshreg.io.second_reader import require_ply
+from meshreg.io.second_reader import SLACK, require_ply
 from meshreg.io.sidecar import write_shift
 from meshreg.types import Frame, Mesh, PointCloud, SourceFile, Survey
 
@@ -189,7 +190,13 @@ def rewrite(source: SourceFile, move: Mover, path: Path) -> tuple[Path, ...]:
                 here = end
             _copy(data, here, len(data), stream)
         _check(temporary, replace(header, textures=renamed), extent, path)
-        require_ply(source.path, temporary, _moved_values(move, turning["vertex"]), path)
+        require_ply(
+            source.path,
+            temporary,
+            _moved_values(move, turning["vertex"]),
+            path,
+            SLACK / metres_per_file_unit(move),
+        )
     return (path, *copy_companions(source, path))
 
 

@@ -21,6 +21,7 @@ from meshreg.io.safe import open_regular
 from meshreg.types import Float64
 
 _BLOCK = 1 << 24
+SLACK = 1e-7  # [m]; coordinates of 1e7 m are rounded by 2e-9 at each step
 _BOM = b"\xef\xbb\xbf"
 _LONGEST = 1 << 16  # bytes of a line, on average
 _LINES = 300  # looked at in each place
@@ -325,7 +326,11 @@ def ply_rows(path: Path) -> PlyRows | None:
 
 
 def require_ply(
-    old: Path, new: Path, moved: Callable[[dict[str, float]], dict[str, float]], path: Path
+    old: Path,
+    new: Path,
+    moved: Callable[[dict[str, float]], dict[str, float]],
+    path: Path,
+    slack: float = 0.0,
 ) -> None:
     """Compare vertices of two PLY files, where no list is in their way.
 
@@ -336,6 +341,8 @@ def require_ply(
         From the values of an old vertex by name to those that change.
     path : Path
         For messages.
+    slack : float
+        By how much rounding on the way may differ between one point and many.
 
     Raises
     ------
@@ -352,9 +359,9 @@ def require_ply(
         places = [one.names.index(name) for name in new_values]
         numbers = np.array([new_values[name] for name in new_values], float)
         kinds = [two.codes.lstrip("<>")[place] for place in places]
-        steps = [{"f": 1e-7, "d": 4e-15}.get(kind, 0.0) for kind in kinds]
+        steps = [{"f": 1e-7, "d": 1e-14}.get(kind, 0.0) for kind in kinds]
         whole = [0.51 * (kind not in "fd") for kind in kinds]
-        return Expected(places, numbers, np.abs(numbers) * steps + np.array(whole) + 1e-38)
+        return Expected(places, numbers, np.abs(numbers) * steps + np.array(whole) + slack + 1e-38)
 
     def rule(words: list[bytes], number: int) -> Expected | None:
         if not one.start <= number < one.start + one.count:

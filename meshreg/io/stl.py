@@ -23,12 +23,13 @@ from meshreg.io.rewriting import (
     FINEST,
     Extent,
     float32_step,
+    metres_per_file_unit,
     moved_points,
     require_unchanged,
     warn,
 )
 from meshreg.io.safe import atomic_file, file_bytes, open_regular
-from meshreg.io.second_reader import ANYTHING, Expected, require_lines, require_rows
+from meshreg.io.second_reader import ANYTHING, SLACK, Expected, require_lines, require_rows
 from meshreg.io.sidecar import write_shift
 from meshreg.types import Float64, Frame, Mesh, SourceFile, Survey, UInt8
 
@@ -222,6 +223,7 @@ def rewrite(source: SourceFile, move: Mover, path: Path) -> tuple[Path, ...]:
 
 def _look_again(old: Path, new: Path, move: Mover, binary: bool, path: Path) -> None:
     """Compare facets by the second reader."""
+    slack = SLACK / metres_per_file_unit(move)
 
     def rule(words: list[bytes], number: int) -> Expected | None:
         del number
@@ -229,7 +231,7 @@ def _look_again(old: Path, new: Path, move: Mover, binary: bool, path: Path) -> 
         if kind[:1] == [b"vertex"] and len(words) == 4:
             corner = np.array([[float(word) for word in words[1:]]])
             values = moved_points(move, corner)[0]
-            return Expected((1, 2, 3), values, 1e-13 * (1 + np.abs(values)))
+            return Expected((1, 2, 3), values, slack + 1e-14 * np.abs(values))
         if kind == [b"facet", b"normal"] and len(words) == 5:
             try:
                 vector = np.array([[float(word) for word in words[2:]]])
@@ -242,7 +244,7 @@ def _look_again(old: Path, new: Path, move: Mover, binary: bool, path: Path) -> 
         normal, corners = np.array([values[:3]]), np.reshape(values[3:12], (3, 3))
         new_normal = move.directions(corners[:1], normal)[0]
         numbers = np.concatenate([new_normal, moved_points(move, corners).ravel()])
-        return Expected(range(12), numbers, 1e-37 + 1e-7 * np.abs(numbers))
+        return Expected(range(12), numbers, slack + 1e-7 * np.abs(numbers))
 
     if not binary:
         require_lines(old, new, rule, path)

@@ -167,7 +167,7 @@ def _line_rule(layout: Layout, move: Mover, flip: bool, least: dict[int, int]) -
         values = np.array([new[column] for column in places])
         if not np.isfinite(old).all():
             values[:] = np.nan
-        return Expected(places, values, digits + 4e-16 * np.abs(values))
+        return Expected(places, values, digits + 2e-15 * np.abs(values))
 
     return rule
 
