@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from meshreg.errors import InputError
 from meshreg.io.frames import Placed, place
+from meshreg.io.images import require_pages
 from meshreg.io.options import ReadOptions
 from meshreg.io.polygons import usable_faces
 from meshreg.io.safe import FARTHEST, fingerprint, sha256
@@ -98,6 +99,7 @@ def assemble_survey(path: Path, raw: RawGeometry, found: Found, options: ReadOpt
     InputError
         Nothing usable is left, or over 1 % of the points are not finite.
     """
+    require_pages(raw.textures)
     raw, notes = _without_lost_points(raw, path)
     if raw.faces is not None:
         raw, more = _without_idle_faces(raw, path)

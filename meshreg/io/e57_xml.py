@@ -24,9 +24,10 @@ from meshreg.io.e57_pages import (
     logical_bytes,
     to_logical,
 )
-from meshreg.io.safe import open_regular
+from meshreg.io.safe import open_regular, require_proportion
 from meshreg.types import Float64
 
+_PER_POINT = 100  # bytes of memory: coordinates, colours, and copies of them
 MAX_DEPTH = 64
 
 
@@ -99,6 +100,8 @@ def read_layout(path: Path) -> Layout:
     layout = Layout(xml, logical_start, is_last, tuple(walk.entries), walk.crs, walk.crs_span)
     for number, scan in enumerate(layout.scans):
         _check_count(scan, number, size, path)
+    total = sum(scan.count for scan in layout.scans)
+    require_proportion(_PER_POINT * total, size, path, f"{total} points")
     return layout
 
 

@@ -17,10 +17,12 @@ import numpy as np
 from meshreg.errors import InputError, MeshregError, ResourceLimitError
 from meshreg.io.crs import crs_text, mend_proj_data
 from meshreg.io.geotiff_sides import MAGIC, Sides
-from meshreg.io.safe import FARTHEST, beside, open_regular
+from meshreg.io.safe import FARTHEST, beside, open_regular, require_proportion
 from meshreg.types import Float64
 
-_WINDOW = 1 << 24  # pixels decoded at once
+_WINDOW = 1 << 22  # pixels decoded at once
+_PER_PIXEL = 64  # bytes of memory: values, what is valid, both sampled anew, rasters of them
+ANY_SIZE = 1 << 62  # `max_pixels` for files that we wrote, or have read before
 _DENSEST = 5000  # pixels that one byte of a compressed file may stand for
 _WORLD_FILES = (".tfw", ".TFW", ".tifw", ".tiffw", ".wld")
 EXPORT = "Export it as a GeoTIFF again."
@@ -95,6 +97,14 @@ def _check_size(dataset: Any, path: Path, max_pixels: int) -> None:
             file=path,
             remedy="The file is cut off or damaged; export or copy it again.",
         )
+    if max_pixels >= ANY_SIZE:
+        return
+    declared = f"{dataset.width} × {dataset.height} pixels of {dataset.count} bands"
+    require_proportion(_PER_PIXEL * pixels, size, path, declared)
+    # GDAL decodes whole blocks, which may be larger than the picture.
+    block = max(rows * cols for rows, cols in dataset.block_shapes) * dataset.count
+    wide = block * max(np.dtype(kind).itemsize for kind in dataset.dtypes)
+    require_proportion(4 * wide, size, path, declared)
 
 
 def is_picture(path: Path, max_pixels: int) -> bool:

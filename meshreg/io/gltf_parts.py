@@ -14,9 +14,11 @@ from meshreg.io.gltf_document import Document, extension
 from meshreg.io.gltf_nodes import mesh_instances
 from meshreg.io.gltf_texture import Pages
 from meshreg.io.options import ReadOptions
+from meshreg.io.safe import require_proportion
 from meshreg.types import Float64, Int32
 
 _POINTS, _TRIANGLES, _STRIP, _FAN = 0, 4, 5, 6
+_PER_POINT = 100  # bytes of memory: coordinates, texture coordinates, and copies of them
 _MOST_REPEATED = 20  # times that instances may multiply what the file holds
 
 
@@ -102,6 +104,7 @@ def _require_bounded(document: Document, instances: list[tuple[int, Float64]]) -
             file=document.path,
             remedy="Export the survey as one mesh.",
         )
+    require_proportion(_PER_POINT * total, held, document.path, f"{total} points and indices")
 
 
 def _primitives(document: Document, mesh: int) -> list[dict[str, Any]]:

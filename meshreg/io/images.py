@@ -9,7 +9,7 @@ from __future__ import annotations
 import io
 import threading
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,12 +18,20 @@ from typing import Any
 import numpy as np
 
 from meshreg.errors import InputError, ResourceLimitError, UsageError
-from meshreg.io.safe import atomic_file, copy_file, fingerprint, free_memory, open_regular
+from meshreg.io.safe import (
+    atomic_file,
+    copy_file,
+    fingerprint,
+    free_memory,
+    open_regular,
+    require_proportion,
+)
 from meshreg.types import Texture, UInt8
 
 FORMATS = ("JPEG", "PNG", "TIFF", "WEBP")
 SUFFIXES = {"JPEG": ".jpg", "PNG": ".png", "TIFF": ".tif", "WEBP": ".webp"}
 _STRIP_ROWS = 512
+_PER_PIXEL = 12  # bytes of memory: Pillow's own, the array that is filled from it, the texels
 _PILLOW = threading.RLock()  # around a setting of Pillow that is one for the whole process
 
 
@@ -49,6 +57,11 @@ class EncodedImage:
     path: Path | None = None
     data: bytes | None = None
     fingerprint: tuple[int, int] = (0, 0)
+
+    @property
+    def n_bytes(self) -> int:
+        """Size of the encoded image."""
+        return self.fingerprint[0] if self.data is None else len(self.data)
 
     def __call__(self) -> UInt8:
         """Return (height, width, 3) or (height, width, 4) uint8.
@@ -116,6 +129,23 @@ def texture_from_array(pixels: Any, name: str = "texture", clamp: bool = False) 
         )
     height, width = pixels.shape[:2]
     return Texture(name, (width, height), lambda: pixels, clamp)
+
+
+def require_pages(textures: Sequence[Texture]) -> None:
+    """Refuse pages that would fill the memory from few bytes, before any is decoded.
+
+    Raises
+    ------
+    ResourceLimitError
+        As `meshreg.io.safe.require_proportion`.
+    """
+    for texture in textures:
+        load = texture.load
+        if isinstance(load, EncodedImage):
+            width, height = texture.size
+            needed = _PER_PIXEL * width * height
+            where = load.path or load.name
+            require_proportion(needed, load.n_bytes, where, f"{width} × {height} pixels")
 
 
 def texture_suffix(texture: Texture) -> str:

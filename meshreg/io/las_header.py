@@ -18,9 +18,10 @@ import numpy as np
 from meshreg.errors import InputError
 from meshreg.io.crs import crs_text, metres_per_unit, parse_crs, with_vertical_unit
 from meshreg.io.laz_chunks import DAMAGED, Vlr, check_chunks
-from meshreg.io.safe import open_regular, require
+from meshreg.io.safe import open_regular, require, require_proportion
 
 _SIZES = {0: 227, 1: 227, 2: 227, 3: 235, 4: 375, 5: 393}  # by minor version
+_PER_POINT = 80  # bytes of memory: steps, coordinates, colours, and copies of them
 _RECORDS = (20, 28, 26, 34, 57, 63, 30, 36, 38, 59, 67)  # by point format
 _LINEAR_UNITS = {9001: 1.0, 9002: 0.3048, 9003: 1200 / 3937}  # GeoTIFF codes
 _ODD = "Its coordinates were taken as a local frame."
@@ -89,6 +90,7 @@ def check_header(path: Path) -> LasHead:
     if inner and form in (4, 5, 9, 10):
         end = min(end, waves)
     require(count, _least_bytes(compressed, record), end - start, path, "header", "points")
+    require_proportion(_PER_POINT * count, size, path, f"{count} points")
     step, offset = struct.unpack_from("<3d", head, 131), struct.unpack_from("<3d", head, 155)
     _check_numbers(path, step, offset)
     if count == 0:

@@ -34,6 +34,8 @@ from meshreg.types import UInt8
 
 _SCHEME_OR_DRIVE = re.compile(r"[A-Za-z][A-Za-z0-9+.\-]*:")
 FARTHEST = 1e12  # coordinates from here on are damage: no unit makes the Earth that large
+_FREELY = 900_000_000  # bytes of memory that any file may take
+_MOST_EXPANDED = 1000  # bytes of memory for each byte of a file beyond its first 1,000,000
 _COPY_BESIDE = "Copy it beside the survey file and write its plain name there."
 
 
@@ -353,6 +355,33 @@ def require(
         )
 
 
+def require_proportion(needed: int, n_bytes: int, file: Path | str, what: str) -> None:
+    """Refuse, before allocating, a small file that asks for much memory.
+
+    What compresses to a thousandth of its size or less holds nothing: such files are made to
+    fill memory. Up to `_FREELY` nothing is asked, so that a blank page of usual size is read.
+
+    Parameters
+    ----------
+    needed : int
+        Memory that reading takes at its peak [bytes].
+    n_bytes : int
+        Size of what is read, as it is stored [bytes].
+    file, what
+        For the message: the file, and what it declares ("20000 × 20000 pixels").
+
+    Raises
+    ------
+    ResourceLimitError
+    """
+    if needed > _FREELY + _MOST_EXPANDED * max(0, n_bytes - 1_000_000):
+        raise ResourceLimitError(
+            f"declares {what}, which take {needed / 1e9:.1f} GB of memory, in {n_bytes} bytes.",
+            file=file,
+            remedy="It is damaged or empty; export it with fewer, or leave it out.",
+        )
+
+
 def free_memory() -> int | None:
     """Return the memory [bytes] that can be had without swapping; None where the system is mute."""
     try:
@@ -422,6 +451,7 @@ __all__: list[str] = [
     "read_into",
     "require",
     "require_inside",
+    "require_proportion",
     "resolve_reference",
     "sha256",
 ]

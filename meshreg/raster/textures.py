@@ -21,7 +21,9 @@ if TYPE_CHECKING:
     from meshreg.raster.shade_kernels import Pages
 
 log = logging.getLogger("meshreg")
-_GROUP_BYTES = 1 << 30  # decoded pages that are in memory together
+_GROUP_BYTES = 1 << 30  # decoded pages that are in memory together, at most
+_GROUP_LEAST = 1 << 28  # ... and at least, however few bytes they were
+_EXPANDED = 400  # ... and for each of these
 _SMALL_PAGE = 1 << 25  # texels
 
 
@@ -55,6 +57,9 @@ def plan_pages(mesh: Mesh, used: Int32, sample: float) -> list[list[PagePlan]]:
     spans = page_spans(mesh.uv, mesh.face_texture, len(mesh.textures))
     groups: list[list[PagePlan]] = []
     free = 0
+    # Pages in memory have no encoded size; they are there already.
+    stored = sum(getattr(mesh.textures[index].load, "n_bytes", _GROUP_BYTES) for index in used)
+    room = min(_GROUP_BYTES, _GROUP_LEAST + _EXPANDED * stored)
     for index in used:
         texture, mine = mesh.textures[index], page == index
         size = median_texel(texel[mine], area[mine])
@@ -68,7 +73,7 @@ def plan_pages(mesh: Mesh, used: Int32, sample: float) -> list[list[PagePlan]]:
         need = 4 * plan.stored[0] * plan.stored[1]
         if not groups or need > free:
             groups.append([])
-            free = _GROUP_BYTES
+            free = room
         groups[-1].append(plan)
         free -= need
     return groups

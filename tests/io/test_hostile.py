@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import os
+import struct
 import subprocess
 import sys
+import zlib
 from pathlib import Path
 
 import laspy
@@ -13,7 +16,7 @@ import pytest
 import rasterio
 from rasterio import Affine
 
-from meshreg.errors import InputError
+from meshreg.errors import InputError, ResourceLimitError
 from meshreg.io import cloud, decoding, read_survey, rewrite_survey, safe
 from meshreg.types import Transform
 
@@ -227,3 +230,99 @@ def test_software_named_in_latin1_is_written_as_it_was(tmp_path):
     assert files[0].read_bytes()[58:90] == name
     again = np.column_stack([getattr(laspy.read(files[0]), axis) for axis in "xyz"])
     np.testing.assert_allclose(again, points + MOVE.offset, atol=1e-3)
+
+
+# Small files that claim much
+
+
+def refused_for_size(path: Path, *said: str) -> None:
+    with pytest.raises(ResourceLimitError) as caught:
+        read_survey(path)
+    assert caught.value.exit_code == 5
+    for text in said:
+        assert text in str(caught.value)
+
+
+def png_of(path: Path, width: int, height: int) -> None:
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return (
+            struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        )
+
+    head = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    body = zlib.compress(bytes(1_000))
+    path.write_bytes(
+        b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", body) + chunk(b"IEND", b"")
+    )
+
+
+def test_a_small_page_of_many_pixels_is_refused_before_it_is_decoded(tmp_path):
+    png_of(tmp_path / "t.png", 20_000, 20_000)
+    (tmp_path / "a.mtl").write_text("newmtl m\nmap_Kd t.png\n")
+    (tmp_path / "a.obj").write_text(
+        "mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nusemtl m\nf 1/1 2/2 3/3\n"
+    )
+    refused_for_size(tmp_path / "a.obj", "20000 × 20000 pixels", "4.8 GB")
+    assert len(read_survey(tmp_path / "a.obj", geometry_only=True).geometry.faces) == 1
+
+
+def test_a_small_dem_of_many_cells_is_refused_before_it_is_decoded(tmp_path):
+    with rasterio.open(
+        tmp_path / "a.tif", "w", driver="GTiff", width=9000, height=9000, count=1,
+        dtype="float32", transform=Affine(1, 0, 10, 0, -1, 20), SPARSE_OK=True, compress="deflate",
+    ):  # fmt: skip
+        pass
+    assert (tmp_path / "a.tif").stat().st_size < 100_000
+    refused_for_size(tmp_path / "a.tif", "9000 × 9000 pixels")
+
+
+def test_instances_may_not_multiply_a_small_gltf(tmp_path):
+    points = np.random.default_rng(0).uniform(0, 1, (20_000, 3)).astype("<f4").tobytes()
+    (tmp_path / "a.bin").write_bytes(points)
+    (tmp_path / "a.gltf").write_text(
+        json.dumps(
+            {
+                "asset": {"version": "2.0"},
+                "scenes": [{"nodes": list(range(900))}],
+                "nodes": [{"mesh": 0}] * 900,
+                "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "mode": 0}]}],
+                "accessors": [
+                    {"bufferView": 0, "componentType": 5126, "count": 20_000, "type": "VEC3"}
+                ],
+                "bufferViews": [{"buffer": 0, "byteLength": len(points)}],
+                "buffers": [{"uri": "a.bin", "byteLength": len(points)}],
+            }
+        )
+    )
+    refused_for_size(tmp_path / "a.gltf", "points and indices")
+
+
+@pytest.mark.parametrize(
+    ("needed", "n_bytes"),
+    [(900_000_000, 10), (3_220_000_000, 4_000_000), (12 * 32_768**2, 14_000_000)],
+)
+def test_what_is_in_proportion_is_read(needed, n_bytes):
+    safe.require_proportion(needed, n_bytes, "a.jpg", "pixels")
+    with pytest.raises(ResourceLimitError):
+        safe.require_proportion(needed + 1_000 * n_bytes + 1, n_bytes, "a.jpg", "pixels")
+
+
+def test_pages_of_few_bytes_are_not_decoded_all_at_once():
+    from meshreg.io.images import EncodedImage
+    from meshreg.raster.textures import plan_pages
+    from meshreg.types import Mesh, Texture
+
+    vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0.0]])
+    faces = np.tile(np.arange(3, dtype=np.int32), (8, 1))
+    uv = np.tile(np.array([[0, 0], [1, 0], [0, 1]], np.float32), (8, 1, 1))
+
+    def groups(n_bytes: int) -> int:
+        pages = tuple(
+            Texture(f"{k}", (5000, 5000), EncodedImage(f"{k}", "PNG", fingerprint=(n_bytes, 0)))
+            for k in range(8)
+        )
+        mesh = Mesh(vertices, faces, None, uv, np.arange(8, dtype=np.int32), pages)
+        return len(plan_pages(mesh, np.arange(8, dtype=np.int32), 1e-9))
+
+    assert groups(1_000) == 4  # two pages of 100 MB fit 256 MiB
+    assert groups(50_000_000) == 1
