@@ -15,13 +15,13 @@ from typing import Any
 
 import numpy as np
 
+from meshreg.checked import shown
 from meshreg.errors import InputError, UsageError
+from meshreg.io.checked_json import parse_json, require_schema
 from meshreg.types import Finding, OffsetEstimate, Registration, Transform, Warp
 
 SCHEMA = "meshreg.registration/1"
 MAX_BYTES = 64_000_000  # a real record has some 20 kB
-_VERDICTS = ("accepted", "review", "rejected")
-_STATUSES = ("ok", "weak", "failed")
 _NUMBERS = ("overlap", "height_median", "height_nmad", "height_rmse", "image_similarity")
 
 
@@ -196,33 +196,16 @@ def read_registration(path: str | Path) -> Registration:
         text = file.read(MAX_BYTES + 1)
     if len(text) > MAX_BYTES:
         raise InputError(f"is larger than {MAX_BYTES} bytes; that is no registration.", file=path)
-    document = _parse(text, path)
-    try:
-        return _registration(document, path)
-    except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
-        raise InputError(
-            f"is no complete registration ({type(error).__name__}: {error}).",
-            file=path,
-            remedy="Run `meshreg register` again.",
-        ) from error
+    return _registration(_parse(text, path), path)
 
 
 def _parse(text: bytes, path: Path) -> dict[str, Any]:
-    def refuse(constant: str) -> None:
-        raise InputError(f"holds {constant}, which is no JSON.", file=path)
-
-    try:
-        document = json.loads(text.decode("utf-8"), parse_constant=refuse)
-    except json.JSONDecodeError as error:
-        place = f"line {error.lineno}, column {error.colno}"
-        raise InputError(f"is no JSON: {error.msg}.", file=path, place=place) from error
-    except (UnicodeDecodeError, RecursionError, ValueError) as error:
-        raise InputError(f"is no JSON text: {error}.", file=path) from error
+    document = parse_json(text, path)
     schema = document.get("schema") if isinstance(document, dict) else None
     found = re.fullmatch(r"meshreg\.registration/(\d{1,9})", str(schema))
     if found is None:
         raise InputError(
-            f'has schema {schema!r}; a registration has "{SCHEMA}".',
+            f'has schema {shown(schema)}; a registration has "{SCHEMA}".',
             file=path,
             remedy="Give the registration.json that `meshreg register` wrote.",
         )
@@ -233,21 +216,19 @@ def _parse(text: bytes, path: Path) -> dict[str, Any]:
             remedy="Use the version of meshreg that wrote it, or a newer one.",
         )
     assert isinstance(document, dict)
+    require_schema(document, "registration.schema.json", path, "Run `meshreg register` again.")
     return document
 
 
 def _registration(document: dict[str, Any], path: Path) -> Registration:
-    verdict = document["verdict"]
-    if verdict not in _VERDICTS:
-        raise InputError(f"has verdict {verdict!r}; expected one of {_VERDICTS}.", file=path)
     try:
         transform = _transform(document, path)
         return Registration(
-            verdict=verdict,
+            verdict=document["verdict"],
             reason=str(document["reason"]),
             transform=transform,
             covariance=document["covariance"],
-            estimates=tuple(_estimate(item, path) for item in document["methods"].items()),
+            estimates=tuple(_estimate(item) for item in document["methods"].items()),
             hypotheses=tuple(dict(item) for item in document["hypotheses"]),
             before=_statistics(document["before"]),
             after=_statistics(document["after"]),
@@ -300,11 +281,8 @@ def _statistics(values: Mapping[str, Any]) -> dict[str, Any]:
     return {key: _number(item) if key in _NUMBERS else item for key, item in values.items()}
 
 
-def _estimate(item: tuple[str, Mapping[str, Any]], path: Path) -> OffsetEstimate:
+def _estimate(item: tuple[str, Mapping[str, Any]]) -> OffsetEstimate:
     method, values = item
-    if values["status"] not in _STATUSES:
-        status = values["status"]
-        raise InputError(f"methods.{method} has the unknown status {status!r}.", file=path)
     east, north = values["offset"] or (None, None)
     return OffsetEstimate(
         method=method,
