@@ -50,7 +50,9 @@ class Internal:
     def applied(self) -> Internal:
         """Return the same, saying that its warp was applied."""
         assert self.warp is not None
-        names = " and ".join(dict.fromkeys((self.warp.horizontal, self.warp.vertical)))
+        models = (("horizontally", self.warp.horizontal), ("in height", self.warp.vertical))
+        parts = [f"{where} by the {model} model" for where, model in models if model != "rigid"]
+        names = " and ".join(parts)
         said = (
             f"{self.said}; the registered survey is warped ({names}), which transform.txt, the "
             "rigid part alone, does not say"
@@ -192,6 +194,10 @@ def _told(flat: _Part, up: _Part | None, options: WarpSettings) -> Internal:
                     f"; the {name} bend strains the survey by {part['strain']:.1%}, over the "
                     f"{options.max_strain:.1%} (warp.max_strain) up to which a warp is applied"
                 )
+                if part["allowed"] != "rigid":
+                    said += f": the {part['allowed']} model is within it"
+                elif len(parts) > 1:
+                    said += f": that part ({name}) stays as it is"
     else:
         rms = [_length(part["held_out_rigid"]) for part in parts.values()]
         also = f" and {rms[1]} in height" if len(rms) > 1 else ""
