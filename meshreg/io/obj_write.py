@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from meshreg.errors import OutputError, UsageError
+from meshreg.io.directions import bend_note, find_directions
 from meshreg.io.images import texture_suffix, write_texture
 from meshreg.io.line_blocks import Block, in_order, line_blocks
 from meshreg.io.mover import Mover
@@ -24,6 +25,7 @@ from meshreg.io.rewriting import (
     moved_points,
     require_close,
     require_unchanged,
+    warn,
 )
 from meshreg.io.safe import atomic_file, open_regular
 from meshreg.io.second_reader import ANYTHING, Expected, LineRule, require_lines
@@ -177,13 +179,14 @@ def rewrite(source: SourceFile, move: Mover, path: Path) -> tuple[Path, ...]:
     require_unchanged(source, path)
     size = max(source.fingerprint[0], 1)
     parts, lines = [], 0
+    normals_in: set[bool] = set()
     with atomic_file(path) as temporary:
         with open_regular(source.path) as stream, open(temporary, "wb") as out:
             if stream.read(3) == _BOM:
                 out.write(_BOM)
             stream.seek(0)
             blocks = line_blocks(stream, source.path)
-            work = _mover_of_blocks(move, path, new_libraries(source))
+            work = _mover_of_blocks(move, path, new_libraries(source), normals_in)
             with closing(in_order(blocks, work, size)) as moved:
                 for block, (text, points) in moved:
                     out.write(text.data)
@@ -198,6 +201,8 @@ def rewrite(source: SourceFile, move: Mover, path: Path) -> tuple[Path, ...]:
                 remedy="Check the disk and run again.",
             )
         require_lines(source.path, temporary, _line_rule(source, move), path)
+    if True in normals_in and (note := bend_note(find_directions(("nx", "ny", "nz")), move)):
+        warn(path, note)
     copies = copy_companions(source, path, but=".mtl" if source.copies else "")
     write_libraries(source, path)
     return (path, *copies)
@@ -258,9 +263,15 @@ def _vectors(block: Block) -> tuple[UInt8, NDArray[np.int64], Float64, NDArray[n
 
 
 def _mover_of_blocks(
-    move: Mover, path: Path, libraries: Callable[[bytes], bytes] | None = None
+    move: Mover,
+    path: Path,
+    libraries: Callable[[bytes], bytes] | None = None,
+    normals_in: set[bool] | None = None,
 ) -> Callable[[Block], tuple[UInt8, Float64]]:
-    """Return the function that moves one block: its new bytes, and its moved points."""
+    """Return the function that moves one block: its new bytes, and its moved points.
+
+    It enters into `normals_in` whether it met normals.
+    """
     from meshreg.io import obj_write_kernels as kernels
 
     def moved(block: Block) -> tuple[UInt8, Float64]:
@@ -277,6 +288,8 @@ def _mover_of_blocks(
         points = moved_points(move, values[kinds == 0])
         values[kinds == 0] = points
         normals = values[kinds == 1]
+        if normals_in is not None:
+            normals_in.add(len(normals) > 0)
         values[kinds == 1] = move.directions(np.zeros_like(normals), normals)
         values[~np.isfinite(values).all(axis=1)] = np.nan  # those lines stay as they are
         decimals = np.maximum(decimals, _FEWEST_DECIMALS)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from meshreg.errors import InputError, UsageError
 from meshreg.io.assemble import Found, RawGeometry, assemble_survey
+from meshreg.io.directions import bend_note, find_directions
 from meshreg.io.mover import Mover
 from meshreg.io.options import ReadOptions
 from meshreg.io.ply_text import read_numbers
@@ -191,6 +192,8 @@ def rewrite(source: SourceFile, move: Mover, path: Path) -> tuple[Path, ...]:
     require_unchanged(source, path)
     data = file_bytes(source.path)
     binary = _is_binary(data, source.path)
+    if note := bend_note(find_directions(("nx", "ny", "nz")), move):
+        warn(path, note)
     extent = Extent()
     with atomic_file(path) as temporary:
         with open(temporary, "wb") as stream:

@@ -144,3 +144,34 @@ def test_splats_look_the_same_from_the_turned_place(degree, mirrored):
             lengths = np.exp([table[k][row] for k in size])
             shapes.append((axes * lengths**2) @ axes.T)
         assert shapes[1] == pytest.approx(1.25**2 * linear @ shapes[0] @ linear.T, abs=1e-9)
+
+
+@pytest.mark.parametrize("suffix", [".obj", ".stl", ".ply", ".csv"])
+def test_a_bend_that_turns_no_direction_is_said(tmp_path, suffix, caplog):
+    from meshreg.io import read_survey, rewrite_survey, write_survey
+    from meshreg.types import Mesh, Survey, Warp
+
+    path = tmp_path / f"a{suffix}"
+    points = RNG.uniform(0, 9, (30, 3))
+    normals = np.tile([0.0, 0.6, 0.8], (30, 1))
+    faces = np.array([[k, k + 1, k + 2] for k in range(28)])
+    if suffix == ".csv":
+        table = np.hstack([points, normals])
+        np.savetxt(path, table, "%.6f", ",", header="x,y,z,nx,ny,nz", comments="")
+    elif suffix == ".ply":
+        head = "ply\nformat ascii 1.0\nelement vertex 30\n" + "".join(
+            f"property double {name}\n" for name in ("x", "y", "z", "nx", "ny", "nz")
+        )
+        table = np.hstack([points, normals]).tolist()
+        rows = "".join(" ".join(map(repr, row)) + "\n" for row in table)
+        path.write_text(head + "end_header\n" + rows)
+    else:
+        write_survey(Survey("reef", Mesh(points, faces)), path)
+        if suffix == ".obj":
+            path.write_text(path.read_text() + "vn 0 0.6 0.8\n")
+    survey = read_survey(path)
+    warp = Warp("", "", (-15.0, -15.0), (15.0, 15.0), np.full((4, 4, 3), 0.01))
+    rewrite_survey(survey, Transform(offset=(1, 2, 3)), tmp_path / "rigid")
+    assert "not by the bend" not in caplog.text
+    rewrite_survey(survey, Transform(offset=(1, 2, 3)), tmp_path / "bent", warp=warp)
+    assert "turned with the survey as a whole, not by the bend" in caplog.text
