@@ -7,7 +7,9 @@ limit, 6 output not written, 130 and 143 stopped by a signal.
 from __future__ import annotations
 
 import atexit
+import errno
 import gc
+import io
 import os
 import sys
 import traceback
@@ -46,7 +48,7 @@ from meshreg.cli_parts.arguments import (
     WarpModel,
 )
 from meshreg.cli_parts.options import join_settings, survey_request, survey_requests
-from meshreg.errors import MeshregError, UsageError
+from meshreg.errors import MeshregError, OutputError, UsageError
 
 if TYPE_CHECKING:
     from meshreg.cli_parts.console import Voice
@@ -55,6 +57,7 @@ if TYPE_CHECKING:
 Result = TypeVar("Result")
 # Typer carries its own click or uses the installed one; this is the root of its errors either way.
 _ClickError = typer.BadParameter.__mro__[2]
+_UNWRITABLE = (errno.ENOSPC, errno.EPIPE, errno.EBADF, errno.EIO, errno.EDQUOT)
 
 app = typer.Typer(
     name="meshreg",
@@ -575,10 +578,14 @@ def _done(
 
     voice = _voice(as_json)
     result = run_stoppable(lambda unfinished: job(voice, unfinished))
-    if as_json:
-        voice.document(result if document is None else document(result))
-    else:
-        show(result, voice)
+    try:
+        if as_json:
+            voice.document(result if document is None else document(result))
+        else:
+            show(result, voice)
+        sys.stdout.flush()
+    except BrokenPipeError:
+        pass  # nobody listens any more; what was done is done, and the exit code tells of it
     return result
 
 
@@ -594,10 +601,12 @@ def run(arguments: Sequence[str]) -> int:
     try:
         code = app(list(arguments), prog_name="meshreg", standalone_mode=False)
     except BrokenPipeError:
-        sys.stderr.close()  # nobody listens any more; keep the interpreter from complaining
-        return 0
+        return 0  # nobody listens any more
     except BaseException as error:
-        return _failed(error, as_json, debug)
+        try:
+            return _failed(error, as_json, debug)
+        except OSError:  # where it would be said cannot be written either
+            return getattr(error, "exit_code", OutputError.exit_code)
     if code == 130:  # Ctrl-C before or after the job itself
         return _failed(KeyboardInterrupt(), as_json, debug)
     return int(code or 0)
@@ -608,6 +617,11 @@ def _failed(error: BaseException, as_json: bool, debug: bool) -> int:
     from meshreg.cli_parts.common import out_of_memory
     from meshreg.cli_parts.guard import StoppedError
 
+    if isinstance(error, SystemExit) and isinstance(error.__context__, BrokenPipeError):
+        return 0  # how rich ends when nobody listens to a help page
+    if isinstance(error, OSError) and error.filename is None and error.errno in _UNWRITABLE:
+        why = os.strerror(error.errno)
+        error = OutputError(f"cannot be written: {why}.", file="standard output")
     if isinstance(error, SystemExit | typer.Exit | typer.Abort):
         code = getattr(error, "exit_code", getattr(error, "code", 1))
         return code if isinstance(code, int) else 1
@@ -646,6 +660,7 @@ def _usage(error: Any, voice: Voice) -> int:
 def main() -> NoReturn:
     """Entry point of the command `meshreg`."""
     gc.set_threshold(50_000, 20, 100)  # arrays make no cycles; the search for some took 0.4 s
+    _mend_streams()
     code = run(sys.argv[1:])
     # What Python does at its end takes half a second where kernels were used, and nothing of ours
     # waits for it: what has to be done is done here.
@@ -656,8 +671,22 @@ def main() -> NoReturn:
     except (BrokenPipeError, ValueError):
         pass  # nobody listens any more
     except OSError:
-        code = code or 1
+        code = code or OutputError.exit_code
     os._exit(code)
+
+
+def _mend_streams() -> None:
+    """Let nothing fail for closed standard streams, or for letters that a terminal lacks."""
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        try:
+            os.fstat(number)
+        except OSError:  # closed: else the next file that is opened would get its number
+            os.open(os.devnull, os.O_RDWR)
+        if getattr(sys, name) is None:
+            setattr(sys, name, os.fdopen(number, "w" if number else "r", encoding="utf-8"))
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
 
 
 if __name__ == "__main__":

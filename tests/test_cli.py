@@ -1194,3 +1194,46 @@ def test_truncated_ply_names_the_place(tmp_path: Path, run: Run) -> None:
     assert "cut.ply" in error
     assert "byte" in error
     assert not (tmp_path / "o").exists()
+
+
+# ---- where nobody listens -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("shell", "code"),
+    [
+        ("info DATA > /dev/full", 6),
+        ("info DATA --json > /dev/full", 6),
+        ("--help > /dev/full", 6),
+        ("info DATA >&-", 0),
+        ("info DATA --json >&-", 0),
+        ("info DATA 2>&- > /dev/null", 0),
+        ("info DATA >&- 2>&- <&-", 0),
+        ("info nothing.obj 2> /dev/full", 3),
+        ("info DATA | true; exit ${PIPESTATUS[0]}", 0),
+        ("--help | true; exit ${PIPESTATUS[0]}", 0),
+    ],
+)
+def test_streams_that_take_nothing_end_quietly(shell: str, code: int) -> None:
+    command = shell.replace("DATA", str(DEMO / "beach_2018.obj"))
+    done = subprocess.run(
+        ["bash", "-c", f'"{sys.executable}" -m meshreg {command}'],
+        capture_output=True, text=True, check=False, cwd=ROOT,
+    )  # fmt: skip
+    assert done.returncode == code, done.stderr
+    assert "Traceback" not in done.stderr
+    assert "internal error" not in done.stderr
+
+
+def test_letters_that_the_terminal_lacks_are_escaped(tmp_path: Path) -> None:
+    path = write_obj(tmp_path / "gr\u00fcn \U0001f41f.obj", 1)
+    for end in ((), ("--json",)):
+        done = subprocess.run(
+            [sys.executable, "-m", "meshreg", "info", str(path), *end],
+            capture_output=True, check=False, cwd=ROOT,
+            env={"PYTHONIOENCODING": "ascii", "LC_ALL": "C", "PATH": "/bin"},
+        )  # fmt: skip
+        assert done.returncode == 0, done.stderr
+        assert done.stdout.isascii()
+        assert b"Traceback" not in done.stderr
+    assert json.loads(done.stdout)["name"] == path.stem

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import os
 import sys
@@ -32,6 +33,14 @@ STAGES = {
 }
 
 
+class _Console(Console):
+    """A console that falls silent when nobody listens any more, and lets the work go on."""
+
+    def on_broken_pipe(self) -> None:
+        """Say nothing further."""
+        self.quiet = True
+
+
 class Voice:
     """Where a command speaks: tables or one JSON document on stdout, the rest on stderr."""
 
@@ -39,14 +48,19 @@ class Voice:
         self.as_json = as_json
         # Where nobody watches, lines may be wider than the 80 columns of an unknown terminal.
         wide = None if sys.stdout.isatty() or "COLUMNS" in os.environ else 120
-        self.out = Console(highlight=False, width=wide)
-        self.err = Console(stderr=True, highlight=False, soft_wrap=True, quiet=as_json)
+        self.out = _Console(highlight=False, width=wide)
+        self.err = _Console(stderr=True, highlight=False, soft_wrap=True, quiet=as_json)
 
     def document(self, document: Any) -> None:
         """Print a JSON document on stdout; nothing else may be there."""
         from meshreg.io.document import to_json
 
-        sys.stdout.write(to_json(document))
+        text = to_json(document)
+        try:
+            text.encode(sys.stdout.encoding or "utf-8")
+        except UnicodeEncodeError:  # JSON can say any letter in ASCII
+            text = "".join(c if ord(c) < 128 else json.dumps(c)[1:-1] for c in text)
+        sys.stdout.write(text)
         sys.stdout.flush()
 
     def say(self, text: str, **styles: Any) -> None:

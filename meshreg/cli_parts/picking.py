@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import signal
+import subprocess
+import sys
 import tempfile
 import webbrowser
 from collections.abc import Callable, Iterator
@@ -39,6 +41,25 @@ class PickRequest:
     allow_same: bool = False
 
 
+@contextmanager
+def _removed_in_any_case(folder: str) -> Iterator[None]:
+    """Let a process that waits for the end of this one, however it comes, remove `folder`."""
+    code = "import shutil, sys; sys.stdin.read(); shutil.rmtree(sys.argv[1], ignore_errors=True)"
+    waiting = subprocess.Popen(
+        [sys.executable, "-I", "-c", code, folder],
+        stdin=subprocess.PIPE,
+        start_new_session=True,  # Ctrl-C is for the page alone
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    try:
+        yield
+    finally:
+        assert waiting.stdin is not None
+        waiting.stdin.close()
+        waiting.wait()
+
+
 def pick(request: PickRequest, voice: Voice) -> None:
     """Show the page until Ctrl-C; every pair is in the file before the page says so."""
     from meshreg.ties.server import PickServer
@@ -50,6 +71,7 @@ def pick(request: PickRequest, voice: Voice) -> None:
         )
     with (
         tempfile.TemporaryDirectory(prefix="meshreg-pick-", ignore_cleanup_errors=True) as folder,
+        _removed_in_any_case(folder),
         only_one(request.ties),
     ):
 

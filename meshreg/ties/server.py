@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-import json
+import re
 import socket
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from meshreg.errors import MeshregError, OutputError
+from meshreg.io.checked_json import parse_json
 from meshreg.ties.desk import Desk
 from meshreg.ties.guard import Guard
 from meshreg.ties.session import StaleError
@@ -24,7 +25,46 @@ _TYPES = {
     ".svg": "image/svg+xml",
 }
 _MAX_BODY = 16_384  # bytes; a change has some hundred
+SLOWEST = 10.0  # seconds that a request may take to arrive
 _WORKERS = 4  # threads that read tiles: each holds two open files
+
+
+def _protocol() -> Any:
+    """Return uvicorn's protocol, which closes a connection whose request does not come whole."""
+    from uvicorn.protocols.http.h11_impl import H11Protocol
+
+    class Protocol(H11Protocol):
+        _deadline: asyncio.TimerHandle | None = None
+
+        def _is_waiting(self) -> bool:
+            return self.cycle is None or self.cycle.response_complete
+
+        def _watch(self) -> None:
+            if self._deadline is not None and not self._is_waiting():
+                self._deadline.cancel()
+                self._deadline = None
+            elif self._deadline is None and self._is_waiting():
+                self._deadline = self.loop.call_later(SLOWEST, self._give_up)
+
+        def _give_up(self) -> None:
+            self._deadline = None
+            if self._is_waiting() and not self.transport.is_closing():
+                self.transport.close()
+
+        def connection_made(self, transport: Any) -> None:
+            super().connection_made(transport)
+            self._watch()
+
+        def data_received(self, data: bytes) -> None:
+            super().data_received(data)
+            self._watch()
+
+        def connection_lost(self, exc: Exception | None) -> None:
+            if self._deadline is not None:
+                self._deadline.cancel()
+            super().connection_lost(exc)
+
+    return Protocol
 
 
 class PickServer:
@@ -68,6 +108,8 @@ class PickServer:
             server_header=False,
             lifespan="off",
             ws="none",
+            http=_protocol(),
+            h11_max_incomplete_event_size=_MAX_BODY,
             timeout_graceful_shutdown=2,
         )
         self._server = uvicorn.Server(config)
@@ -135,7 +177,10 @@ def make_app(desk: Desk, pool: ThreadPoolExecutor) -> Any:
         source = desk.reference if at["side"] == "reference" else desk.moving
         if at["side"] not in ("reference", "moving"):
             return answer({"error": "There is no such picture."}, 404)
-        png = await run(source.tile, at["level"], at["column"], at["row"])
+        numbers = [at[name] for name in ("level", "column", "row")]
+        if not all(re.fullmatch(r"[0-9]{1,9}", number) for number in numbers):
+            return answer({"error": "There is no such tile."}, 404)
+        png = await run(source.tile, *map(int, numbers))
         if png is None:
             return answer({"error": "There is no such tile."}, 404)
         headers = {"cache-control": "private, max-age=86400"}
@@ -143,9 +188,11 @@ def make_app(desk: Desk, pool: ThreadPoolExecutor) -> Any:
 
     async def change(request: Request) -> Response:
         try:
-            values = await _body(request)
+            values = await asyncio.wait_for(_body(request), SLOWEST)
             revision, what = values.pop("revision"), values.pop("what")
-        except (ValueError, KeyError, TypeError, RecursionError):
+        except TimeoutError:
+            return answer({"error": "The change did not come in time."}, 408)
+        except (MeshregError, ValueError, KeyError, TypeError, RecursionError):
             return answer({"error": "A change is a small JSON object with revision and what."}, 400)
         try:
             await run(desk.change, revision, str(what), values)
@@ -162,7 +209,7 @@ def make_app(desk: Desk, pool: ThreadPoolExecutor) -> Any:
             Route("/api/job", job),
             Route("/api/state", state),
             Route("/api/change", change, methods=["POST"]),
-            Route("/tiles/{side}/{level:int}/{column:int}/{row:int}.png", tile),
+            Route("/tiles/{side}/{level}/{column}/{row}.png", tile),
         ]
     )
 
@@ -176,7 +223,7 @@ async def _body(request: Any) -> dict[str, Any]:
         body += part
         if len(body) > _MAX_BODY:
             raise ValueError("too large")
-    values = json.loads(body)
+    values = parse_json(body, Path("the change"))
     if not isinstance(values, dict):
         raise ValueError("no object")
     return values

@@ -5,9 +5,12 @@ from __future__ import annotations
 import io
 import json
 import math
+import signal
+import socket
 import subprocess
 import sys
 import threading
+import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -484,3 +487,60 @@ def test_pick_says_what_it_lacks(tmp_path, capsys):
     assert cli.run(["pick", str(out), "-o", str(tmp_path / "none" / "ties.csv")]) == 2
     assert cli.run(["pick", str(out), "--registration", str(out), *ties]) == 2
     assert sorted(p.name for p in tmp_path.iterdir()) == ["OUT"]
+
+
+# What others may send
+
+
+@pytest.mark.parametrize("number", ["9" * 4301, "-1", "1.5", "\u0663", "1" * 10, "0x1", " 1"])
+def test_a_tile_number_of_any_kind_is_a_tile_that_is_not_there(client, number):
+    for place in (f"{number}/0/0", f"0/{number}/0", f"0/0/{number}"):
+        assert client.get(f"/tiles/reference/{place}.png").status_code == 404
+
+
+@pytest.mark.parametrize("value", ["1" * 4000, "1" * 5000, "1e400", "NaN", "[" * 5000, "1e300"])
+def test_a_number_of_any_size_is_no_change(client, desk, value):
+    body = f'{{"revision": 0, "what": "place", "side": "reference", "at": [{value}, 0]}}'
+    answer = client.post("/api/change", content=body, headers={"content-type": "application/json"})
+    assert answer.status_code == 400
+    assert desk.session.revision == 0
+
+
+def test_a_connection_that_asks_nothing_is_closed(desk, monkeypatch):
+    """Neither silence, nor half a request, nor half a body keeps a connection open."""
+    from meshreg.ties import server as serving
+
+    monkeypatch.setattr(serving, "SLOWEST", 0.3)
+    server = serving.PickServer(desk)
+    thread = threading.Thread(target=server.run)
+    thread.start()
+    try:
+        for sent in (b"", b"GET / HT", b"GET / HTTP/1.1\r\nHost: "):
+            with socket.create_connection(("127.0.0.1", server.port), timeout=20) as line:
+                line.sendall(sent)
+                assert line.recv(1000) == b""
+        with socket.create_connection(("127.0.0.1", server.port), timeout=20) as line:
+            line.sendall(b"GET /api/job HTTP/1.1\r\nHost: x\r\n\r\n")  # whole: it is answered
+            assert line.recv(1000).startswith(b"HTTP/1.1 403")
+    finally:
+        server.stop()
+        thread.join(20)
+    assert not thread.is_alive()
+
+
+def test_nothing_stays_behind_a_pick_that_is_killed(tmp_path):
+    left = tmp_path / "meshreg-pick-x"
+    left.mkdir()
+    (left / "picture.tif").write_text("")
+    code = (
+        "import os, signal, sys\n"
+        "from meshreg.cli_parts.picking import _removed_in_any_case\n"
+        "with _removed_in_any_case(sys.argv[1]):\n"
+        "    os.kill(os.getpid(), signal.SIGKILL)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code, str(left)], check=False)
+    assert done.returncode == -signal.SIGKILL
+    until = time.monotonic() + 20
+    while left.exists() and time.monotonic() < until:
+        time.sleep(0.05)
+    assert not left.exists()
