@@ -1,4 +1,4 @@
-"""The other side of `meshreg.io.decoding`: a program of its own, which imports nothing of meshreg.
+"""The other side of `meshreg.io.decoding`: a program of its own, which starts without meshreg.
 
 It reads one JSON request a line and answers with one JSON line; what it decodes goes into a block
 of memory that it shares with its parent. It ends with its standard input.
@@ -74,7 +74,20 @@ class E57:
         return {"count": count}
 
 
-KINDS = {"laz": Laz, "e57": E57}
+class Page:
+    """A texture page by Pillow; the conversions are meshreg's own."""
+
+    def __init__(self, setup: dict[str, Any]) -> None:
+        self.file, self.name = setup["file"], setup["name"]
+
+    def read(self, slot: memoryview) -> Any:
+        """Decode the page to the front of the slot; return its shape."""
+        from meshreg.io.images import decode_into
+
+        return {"shape": decode_into(self.file, self.name, slot)}
+
+
+KINDS = {"laz": Laz, "e57": E57, "page": Page}
 
 
 def main() -> None:
@@ -97,7 +110,8 @@ def main() -> None:
             answer = getattr(decoder, name)(**request)
         except BaseException as error:  # a panic of Rust is no Exception
             kind, text = type(error).__name__, " ".join(str(error).split())
-            answer = {"error": f"{kind}: {text[:200]}"}
+            own = getattr(error, "message", None)  # of meshreg's own errors
+            answer = {"error": str(own or f"{kind}: {text[:200]}")}
         answers.write(json.dumps(answer) + "\n")
         answers.flush()
 

@@ -36,10 +36,12 @@ class Decoder:
     ----------
     kind : str
         Key in `meshreg.io.decoder_process.KINDS`.
-    path : Path
+    path : Path or None
         A regular file.
     slot : int
         Size of each of the two parts of the shared memory [bytes].
+    data : bytes, optional
+        What is decoded, where it is no file of its own.
     **setup
         Plain values for the decoder.
 
@@ -51,16 +53,26 @@ class Decoder:
         No process can be started.
     """
 
-    def __init__(self, kind: str, path: Path, slot: int = 0, **setup: Any) -> None:
-        with open_regular(path) as stream:
-            size = os.fstat(stream.fileno()).st_size
+    def __init__(
+        self, kind: str, path: Path | None, slot: int = 0, data: bytes | None = None, **setup: Any
+    ) -> None:
         self.path, self.place = path, ""
+        if path is not None:
+            with open_regular(path) as stream:
+                size = os.fstat(stream.fileno()).st_size
+        else:
+            size = len(data or b"")
         self._slot, self._block = slot, _shared(2 * slot) if slot else None
+        given = None if path is not None else _shared(0)
+        if given is not None:
+            with open(given, "wb", closefd=False) as out:
+                out.write(data or b"")
+        handles = [handle for handle in (self._block, given) if handle is not None]
         arguments = {
             "kind": kind,
-            "file": str(path.resolve()),
-            "memory": _MEMORY + _PER_BYTE * size,
-            "search": [entry for entry in sys.path if entry],
+            "file": f"/dev/fd/{given}" if path is None else str(path.resolve()),
+            "memory": _MEMORY + _PER_BYTE * size + slot,
+            "search": [*(entry for entry in sys.path if entry), str(_PROGRAM.parents[2])],
             "block": self._block,
             "slot": slot,
             **setup,
@@ -73,7 +85,7 @@ class Decoder:
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.DEVNULL,
-                pass_fds=() if self._block is None else (self._block,),
+                pass_fds=handles,
             )
         except OSError as error:
             raise ResourceLimitError(
@@ -82,8 +94,8 @@ class Decoder:
                 remedy="Close other programs.",
             ) from error
         finally:
-            if self._block is not None:
-                os.close(self._block)
+            for handle in handles:
+                os.close(handle)
 
     def __enter__(self) -> Decoder:
         return self

@@ -7,6 +7,7 @@ texture coordinates refer to the pixels as they are stored.
 from __future__ import annotations
 
 import io
+import math
 import threading
 import warnings
 from collections.abc import Iterator, Sequence
@@ -18,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from meshreg.errors import InputError, ResourceLimitError, UsageError
+from meshreg.io.decoding import Decoder
 from meshreg.io.safe import (
     atomic_file,
     copy_file,
@@ -31,6 +33,7 @@ from meshreg.types import Texture, UInt8
 FORMATS = ("JPEG", "PNG", "TIFF", "WEBP")
 SUFFIXES = {"JPEG": ".jpg", "PNG": ".png", "TIFF": ".tif", "WEBP": ".webp"}
 _STRIP_ROWS = 512
+_APART = 1 << 25  # pixels from which a page is decoded in a process of its own
 _PER_PIXEL = 12  # bytes of memory: Pillow's own, the array that is filled from it, the texels
 _PILLOW = threading.RLock()  # around a setting of Pillow that is one for the whole process
 
@@ -80,8 +83,24 @@ class EncodedImage:
         with _opened(self.path, self.data, self.name) as image:
             # Pillow keeps 4 bytes a pixel beside the array that is filled from it.
             _require_memory(8 * image.width * image.height, image.size, self.name)
-            pixels: UInt8 = _pixels(image, self.name)
-            return pixels
+            if image.width * image.height <= _APART:
+                pixels: UInt8 = _pixels(image, self.name)
+                return pixels
+            room = 4 * image.width * image.height
+        with Decoder("page", self.path, room, data=self.data, name=self.name) as decoder:
+            decoder.place = self.name if self.path is None else ""
+            shape = decoder.ask("read", slot=0)["shape"]
+            flat = np.frombuffer(decoder.slot(0), np.uint8, math.prod(shape))
+            return flat.reshape(shape)
+
+
+def decode_into(file: str, name: str, slot: memoryview) -> tuple[int, ...]:
+    """Decode an image file to the front of some memory; return its shape (H, W, 3 or 4)."""
+    with _opened(Path(file), None, name) as image:
+        pixels = _pixels(image, name, np.frombuffer(slot, np.uint8))
+        if not np.shares_memory(pixels, np.frombuffer(slot, np.uint8)):
+            np.frombuffer(slot, np.uint8)[: pixels.size] = pixels.ravel()
+        return pixels.shape
 
 
 def open_texture(
@@ -282,8 +301,8 @@ def _to_eight_bits(values: Any) -> UInt8:
     return scaled
 
 
-def _pixels(image: Any, name: str) -> UInt8:
-    """Decode an image into (height, width, 3 or 4) uint8."""
+def _pixels(image: Any, name: str, room: UInt8 | None = None) -> UInt8:
+    """Decode an image into (height, width, 3 or 4) uint8, at the front of `room` if it can be."""
     if isinstance(image, _RasterioImage):
         return image.pixels()
     image.load()
@@ -298,7 +317,8 @@ def _pixels(image: Any, name: str) -> UInt8:
     if image.mode == "LAB":
         raise InputError("has CIELAB pixels.", file=name, remedy="Convert it to RGB.")
     # By strips, because both Pillow's conversion and its export hold the whole image again.
-    out = np.empty((image.height, image.width, len(mode)), np.uint8)
+    shape = (image.height, image.width, len(mode))
+    out = np.empty(shape, np.uint8) if room is None else room[: math.prod(shape)].reshape(shape)
     for top in range(0, image.height, _STRIP_ROWS):
         bottom = min(top + _STRIP_ROWS, image.height)
         strip = image.crop((0, top, image.width, bottom))

@@ -379,7 +379,8 @@ def show(table: dict[str, collections.Counter[str]], failed: list[str], seconds:
         heads = ["cases", *columns]
         cells = [str(n).rjust(max(9, len(c) + 2)) for n, c in zip(row, heads, strict=True)]
         print(kind.ljust(width) + "".join(cells))
-        total += counts
+        if counts is not total:
+            total += counts
     print(f"{sum(total.values())} cases in {seconds:.0f} s; {len(failed)} failed")
     for text in failed[:40]:
         print("  " + text)

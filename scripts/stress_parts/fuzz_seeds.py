@@ -246,6 +246,11 @@ def colmap(binary: bool) -> dict[str, bytes]:
     """Return a COLMAP model with its positions."""
     points, _ = ground(5)
     names = [f"IMG {k}.jpg" for k in range(6)]
+    seen = [
+        range(6),
+        range(6),
+        *[range(0)] * (len(points) - 2),
+    ]  # points by the images that show them
     text = {
         "cameras": "1 PINHOLE 100 80 90 90 50 40\n",
         "images": "".join(
@@ -253,7 +258,8 @@ def colmap(binary: bool) -> dict[str, bytes]:
             for k, name in enumerate(names)
         ),
         "points3D": "".join(
-            f"{k + 1} {x} {y} {z} 90 90 90 0.5 1 0 2 0\n" for k, (x, y, z) in enumerate(points)
+            f"{k + 1} {x} {y} {z} 90 90 90 0.5 {' '.join(f'{m + 1} {k}' for m in seen[k])}\n"
+            for k, (x, y, z) in enumerate(points)
         ),
     }
     files = {f"{name}.txt": value.encode() for name, value in text.items()}
@@ -271,7 +277,8 @@ def colmap(binary: bool) -> dict[str, bytes]:
             "points3D.bin": struct.pack("<Q", len(points))
             + b"".join(
                 struct.pack("<Q3d3Bd", k + 1, *point, 90, 90, 90, 0.5)
-                + struct.pack("<Q4i", 2, 1, 0, 2, 0)
+                + struct.pack("<Q", len(seen[k]))
+                + b"".join(struct.pack("<ii", m + 1, k) for m in seen[k])
                 for k, point in enumerate(points)
             ),
         }
@@ -351,10 +358,10 @@ def record() -> dict[str, bytes]:
         for path in (here / "OUT").glob("*"):
             if path.suffix in (".json", ".npz"):
                 files[f"OUT/{path.name}"] = path.read_bytes()
-    rows = ["id,name,reference_east,reference_north,moving_east,moving_north"]
+    rows = ["id,name,reference_east,reference_north,moving_east,moving_north,crs"]
     for k in range(8):
         x, y = 731_002 + 2 * (k % 4), 5_704_990 - 3 * (k // 4)
-        rows.append(f"{k + 1},p{k},{x},{y},{x + 1.0},{y}")
+        rows.append(f"{k + 1},p{k},{x},{y},{x + 1.0},{y},EPSG:32754")
     files["ties.csv"] = ("\n".join(rows) + "\n").encode()
     return files
 
@@ -412,7 +419,7 @@ def seeds() -> dict[str, Callable[[], Seed]]:
             "a.obj", weights={"coords.txt": 20},
         ),
         "sides-shift": lambda: Seed(
-            beside(ply(False), SHIFT__txt="EPSG::32754\n731000 5705000 0\n"),
+            beside(ply(False), SHIFT__txt="731000 5705000 0\n"),
             "a.ply", weights={"SHIFT.txt": 20},
         ),
         "sides-metadata": lambda: Seed(

@@ -79,6 +79,35 @@ def test_a_decoder_has_a_bound_on_its_memory(tmp_path, monkeypatch):
     refused(tmp_path / "a.laz", "cannot be decoded")
 
 
+@pytest.mark.parametrize("mode", ["RGB", "RGBA", "L", "I;16"])
+@pytest.mark.parametrize("inside", [False, True])
+def test_a_large_page_comes_the_same_from_a_process_of_its_own(tmp_path, monkeypatch, mode, inside):
+    from PIL import Image
+
+    from meshreg.io import images
+
+    rng = np.random.default_rng(5)
+    depth = {"RGB": (3,), "RGBA": (4,)}.get(mode, ())
+    kind = np.uint16 if mode == "I;16" else np.uint8
+    values = rng.integers(0, np.iinfo(kind).max, (37, 53, *depth), kind)
+    path = tmp_path / "t.png"
+    Image.fromarray(values).save(path)
+
+    def texture():
+        if inside:
+            return images.open_texture_bytes(path.read_bytes(), "t.png", 10**6)
+        return images.open_texture(path, 10**6)
+
+    here = texture().load()
+    monkeypatch.setattr(images, "_APART", 100)
+    apart = texture().load()
+    assert apart.shape == here.shape
+    np.testing.assert_array_equal(apart, here)
+    path.write_bytes(path.read_bytes()[:200])
+    with pytest.raises(InputError, match="damaged"):
+        texture().load()
+
+
 # Files that change while they are read
 
 
