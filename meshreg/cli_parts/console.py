@@ -164,13 +164,30 @@ class _WarningHandler(logging.Handler):
             self._voice.warn(text)
 
 
+class _LogFile(logging.FileHandler):
+    """Writes all to a file; `failed` is the first thing that could not be written."""
+
+    failed: BaseException | None = None
+
+    def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802 (logging's name)
+        del record
+        self.failed = self.failed or sys.exception()
+
+
 @contextmanager
 def logging_to(voice: Voice, path: Path | None = None) -> Iterator[None]:
-    """Send warnings to the voice, and everything to the file `path` while the block runs."""
+    """Send warnings to the voice, and everything to the file `path` while the block runs.
+
+    Raises
+    ------
+    OSError
+        At the end, if the file could not be written.
+    """
     logger = logging.getLogger("meshreg")
     handlers: list[logging.Handler] = [_WarningHandler(voice)]
+    file = None
     if path is not None:
-        file = logging.FileHandler(path, encoding="utf-8", errors="backslashreplace")
+        file = _LogFile(path, encoding="utf-8", errors="backslashreplace")
         file.setFormatter(logging.Formatter("%(asctime)s %(levelname)-7s %(message)s"))
         handlers.append(file)
     level = logger.level
@@ -179,6 +196,8 @@ def logging_to(voice: Voice, path: Path | None = None) -> Iterator[None]:
         logger.addHandler(handler)
     try:
         yield
+        if file is not None and file.failed is not None:
+            raise file.failed
     finally:
         logger.setLevel(level)
         for handler in handlers:

@@ -98,7 +98,10 @@ def run_stoppable(job: Callable[[Unfinished], _T]) -> _T:
                 _stop(thread, done, unfinished, signals[0])
                 break
         if signals:
-            raise StoppedError(signals[0])
+            stopped = StoppedError(signals[0])
+            if "value" in outcome:  # the job ended before it heard of it
+                stopped.add_note("what was asked for was done already.")
+            raise stopped
     thread.join()
     if "error" in outcome:
         raise outcome["error"]

@@ -56,20 +56,16 @@ def write_report(folder: Path) -> Path:
     OutputError
         If the page cannot be written.
     """
-    from meshreg.io.atomic import atomic_file
     from meshreg.io.evidence import read_evidence
-    from meshreg.io.manifest import add_to_manifest, require_ours
+    from meshreg.io.manifest import require_ours, write_into
     from meshreg.io.record import read_registration
     from meshreg.report import gather, report_page
 
     folder = _result_folder(folder)
     require_ours(folder, (PAGE,))
     result = gather(read_registration(folder), read_evidence(folder), folder)
-    path = folder / PAGE
-    with atomic_file(path) as partial:
-        partial.write_text(report_page(result), encoding="utf-8")
-    add_to_manifest(folder, (PAGE,))
-    return path
+    write_into(folder, {PAGE: report_page(result).encode("utf-8")})
+    return folder / PAGE
 
 
 def _result_folder(folder: Path) -> Path:

@@ -43,7 +43,7 @@ class ValidateRequest:
 def validate(request: ValidateRequest) -> dict[str, Any]:
     """Compare, write validation.json, .html and figures into OUT, say so in its report.html."""
     from meshreg.io.document import read_registration, to_json
-    from meshreg.io.manifest import add_to_manifest, require_ours
+    from meshreg.io.manifest import require_ours, write_into
     from meshreg.ties.figure import draw_validation
     from meshreg.ties.page import sentence, validation_page
     from meshreg.ties.placing import read_placing
@@ -77,11 +77,8 @@ def validate(request: ValidateRequest) -> dict[str, Any]:
     page = validation_page(document, drawn, names)  # type: ignore[arg-type]
     pictures = {f"figures/{name}.png": picture for name, picture in drawn.items()}
     require_ours(request.out, tuple(pictures))
-    for name, picture in pictures.items():
-        _write(request.out / name, picture)
-    _write(request.out / "validation.html", page.encode("utf-8"))
-    _write(request.out / "validation.json", to_json(document).encode("utf-8"))
-    add_to_manifest(request.out, (*pictures, *PAGES))
+    pages = (page.encode("utf-8"), to_json(document).encode("utf-8"))
+    write_into(request.out, {**pictures, **dict(zip(PAGES, pages, strict=True))})
     remake_report(request.out)
     return document
 
@@ -227,15 +224,6 @@ def _png(figure: Any) -> bytes:
     stream = io.BytesIO()
     figure.savefig(stream, format="png")
     return stream.getvalue()
-
-
-def _write(path: Path, data: bytes) -> None:
-    from meshreg.io.atomic import as_output_error, atomic_file
-
-    with as_output_error(path):
-        path.parent.mkdir(exist_ok=True)
-    with atomic_file(path) as temporary:
-        temporary.write_bytes(data)
 
 
 def show(document: dict[str, Any], out: Path, voice: Voice) -> None:

@@ -13,7 +13,7 @@ import json
 import logging
 import os
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -66,12 +66,40 @@ def write_manifest(folder: Path, command: str, names: Sequence[str] | None = Non
     _save(folder, {"schema": SCHEMA, "command": command, "files": files})
 
 
-def add_to_manifest(folder: Path, names: Sequence[str]) -> None:
-    """Enter files that were written later; where there is no manifest, nothing is done."""
-    if (folder / NAME).is_file():
-        document = _document(folder)
-        document["files"].update({name: _entry(folder / name) for name in names})
-        _save(folder, document)
+def write_into(folder: Path, files: Mapping[str, bytes]) -> None:
+    """Write files into a result that is there already, each whole, and enter them in its manifest.
+
+    They are entered before, beside what they replace, so that also a run that is killed in between
+    leaves only files that are known to be ours. Where there is no manifest, none is made.
+
+    Raises
+    ------
+    OutputError
+        One cannot be written; those before it are new.
+    """
+    from meshreg.io.atomic import as_output_error, atomic_file
+
+    document = _document(folder) if (folder / NAME).is_file() else None
+    coming = {
+        name: {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
+        for name, data in files.items()
+    }
+    if document is not None:
+        known = document["files"]
+        waiting = {
+            name: {**_present(folder / name, known[name]), "coming": entry}
+            if name in known
+            else entry
+            for name, entry in coming.items()
+        }
+        _save(folder, {**document, "files": {**known, **waiting}})
+    for name, data in files.items():
+        with as_output_error(folder / name):
+            (folder / name).parent.mkdir(exist_ok=True)
+        with atomic_file(folder / name) as partial:
+            partial.write_bytes(data)
+    if document is not None:
+        _save(folder, {**document, "files": {**document["files"], **coming}})
 
 
 def require_ours(folder: Path, names: Sequence[str]) -> None:
@@ -287,7 +315,25 @@ def _sha256(path: Path) -> str:
 def _is_as_written(path: Path, entry: dict[str, Any] | None) -> bool:
     if entry is None or path.is_symlink() or not path.is_file():
         return False
-    return bool(path.stat().st_size == entry["bytes"] and _sha256(path) == entry["sha256"])
+    either = [entry, entry["coming"]] if _is_entry(entry.get("coming")) else [entry]
+    sizes = [one for one in either if one["bytes"] == path.stat().st_size]
+    return bool(sizes) and _sha256(path) in [one["sha256"] for one in sizes]
+
+
+def _present(path: Path, entry: dict[str, Any]) -> dict[str, Any]:
+    """Return what is there: of an entry that a killed run left with two, the one that it is."""
+    coming = entry.get("coming")
+    if _is_entry(coming) and _is_as_written(path, coming):
+        return dict(coming)
+    return entry
+
+
+def _is_entry(entry: Any) -> bool:
+    return (
+        isinstance(entry, dict)
+        and type(entry.get("bytes")) is int
+        and isinstance(entry.get("sha256"), str)
+    )
 
 
 def _signature(path: Path) -> tuple[int, ...]:
@@ -329,12 +375,7 @@ def _is_manifest(document: Any) -> bool:
         isinstance(document, dict)
         and document.get("schema") == SCHEMA
         and isinstance(document.get("files"), dict)
-        and all(
-            isinstance(entry, dict)
-            and type(entry.get("bytes")) is int
-            and isinstance(entry.get("sha256"), str)
-            for entry in document["files"].values()
-        )
+        and all(map(_is_entry, document["files"].values()))
     )
 
 

@@ -79,7 +79,10 @@ def draw_figures(
 def _drawn(
     jobs: Mapping[str, Callable[[], Any]], folder: Path, claim: Callable[[int], bool] | None
 ) -> list[Path]:
-    """Draw and save; a figure that fails is a warning in the log."""
+    """Draw and save; a figure that cannot be drawn is a warning in the log.
+
+    One that cannot be saved is an OSError: on a full disk the rest of a result is not whole either.
+    """
     written = []
     for number, (name, draw) in enumerate(jobs.items()):
         if claim is not None and not claim(number):
@@ -87,22 +90,29 @@ def _drawn(
         path = folder / f"{name}.png"
         try:
             figure = draw()
-            if figure is not None:
-                _save(figure, path)
-                written.append(path)
+            picture = None if figure is None else _picture(figure)
         except Exception as error:
             _LOG.warning("The figure %s was not drawn: %s: %s", name, type(error).__name__, error)
             _LOG.debug("why", exc_info=True)
+            continue
+        if picture is not None:
+            _save(picture, path)
+            written.append(path)
     return written
 
 
-def _save(figure: Any, path: Path) -> None:
-    """Draw once and write a PNG without transparency: half the time of `savefig`, smaller files."""
+def _picture(figure: Any) -> Any:
+    """Draw once, without transparency: half the time of `savefig`, smaller files."""
     from PIL import Image
-    from PIL.PngImagePlugin import PngInfo
 
     figure.canvas.draw()
-    picture = Image.fromarray(np.asarray(figure.canvas.buffer_rgba())[..., :3])
+    return Image.fromarray(np.asarray(figure.canvas.buffer_rgba())[..., :3])
+
+
+def _save(picture: Any, path: Path) -> None:
+    """Write a picture as PNG, whole or not at all."""
+    from PIL.PngImagePlugin import PngInfo
+
     about = PngInfo()
     about.add_text("Software", "meshreg")
     partial_path = path.with_name(f".{path.name}.tmp")

@@ -17,10 +17,10 @@ from meshreg.errors import UsageError
 from meshreg.io import atomic, manifest
 from meshreg.io.atomic import atomic_folder
 from meshreg.io.manifest import (
-    add_to_manifest,
     require_apart,
     require_only_ours,
     require_ours,
+    write_into,
 )
 
 
@@ -322,17 +322,48 @@ def test_an_input_within_is_refused_whatever_way_it_is_named(out: Path) -> None:
 def test_later_files_are_entered_and_foreign_ones_not_written_over(out: Path) -> None:
     page = out / "validation.html"
     require_ours(out, ["validation.html", "registration.json"])
-    page.write_text("ours")
-    add_to_manifest(out, ["validation.html"])
-    require_ours(out, ["validation.html"])
+    write_into(out, {"validation.html": b"ours", "figures/validation.png": b"png"})
+    assert page.read_bytes() == b"ours"
+    require_ours(out, ["validation.html", "figures/validation.png"])
     assert set(require_only_ours(out, ("registration.json",))) == set(tree(out))
     page.write_text("a remark of mine")
     with pytest.raises(UsageError, match=r"validation\.html: is not as meshreg wrote it"):
         require_ours(out, ["validation.html"])
     (out / "manifest.json").unlink()
     require_ours(out, ["validation.html"])
-    add_to_manifest(out, ["validation.html"])
+    write_into(out, {"validation.html": b"ours"})
+    assert page.read_bytes() == b"ours"
     assert not (out / "manifest.json").exists()
+
+
+def test_a_run_killed_at_any_file_leaves_only_files_that_are_ours(
+    out: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Which the next run writes over, and --overwrite replaces; before it the old or the new."""
+    names = ("validation.html", "validation.json")
+    for files in (dict.fromkeys(names, b"first"), dict.fromkeys(names, b"second")):
+        for at in range(4):  # the manifest, two files, the manifest
+            replaced = []
+
+            def replace(source: Path, to: Path, at: int = at, seen: list = replaced) -> None:
+                if len(seen) == at:
+                    raise KeyboardInterrupt
+                seen.append(to)
+                os.rename(source, to)
+
+            with monkeypatch.context() as patch:
+                patch.setattr("meshreg.io.atomic.os.replace", replace)
+                with pytest.raises(KeyboardInterrupt):
+                    write_into(out, {name: data + bytes([at]) for name, data in files.items()})
+            assert len(replaced) == at
+            require_ours(out, names)
+            assert set(require_only_ours(out, ("registration.json",))) == set(tree(out))
+        write_into(out, files)
+        assert {(out / name).read_bytes() for name in names} == set(files.values())
+        require_ours(out, names)
+    (out / names[0]).write_text("a remark of mine")
+    with pytest.raises(UsageError, match="is not as meshreg wrote it"):
+        require_ours(out, names)
 
 
 @settings(
