@@ -322,10 +322,8 @@ def _is_as_written(path: Path, entry: dict[str, Any] | None) -> bool:
 
 def _present(path: Path, entry: dict[str, Any]) -> dict[str, Any]:
     """Return what is there: of an entry that a killed run left with two, the one that it is."""
-    coming = entry.get("coming")
-    if _is_entry(coming) and _is_as_written(path, coming):
-        return dict(coming)
-    return entry
+    coming: dict[str, Any] = entry.get("coming") or {}
+    return coming if _is_entry(coming) and _is_as_written(path, coming) else entry
 
 
 def _is_entry(entry: Any) -> bool:
