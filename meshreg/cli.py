@@ -188,7 +188,7 @@ def report(
 
     _done(
         as_json,
-        lambda voice, unfinished: reporting.write_report(out),
+        lambda voice, unfinished: reporting.remake_report(out),
         reporting.show,
         reporting.document,
     )

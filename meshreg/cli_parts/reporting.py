@@ -68,6 +68,25 @@ def write_report(folder: Path) -> Path:
     return folder / PAGE
 
 
+def remake_report(folder: Path) -> Path:
+    """Do `write_report`; a saved result that the page cannot show is bad input.
+
+    Raises
+    ------
+    InputError
+        As `write_report`, and where record and evidence do not fit together.
+    """
+    try:
+        return write_report(folder)
+    except (ArithmeticError, LookupError, TypeError, ValueError, AttributeError) as error:
+        raise InputError(
+            f"cannot be shown: its record and its evidence do not fit ({type(error).__name__}: "
+            f"{error}).",
+            file=folder,
+            remedy="Run `meshreg register` again.",
+        ) from error
+
+
 def _result_folder(folder: Path) -> Path:
     folder = Path(folder)
     if not (folder / "registration.json").is_file():
