@@ -25,18 +25,19 @@ def run(command, main, here):
     if what == "crash":
         os.kill(os.getpid(), signal.SIGSEGV)
     if what == "hang":
-        time.sleep(60)
+        time.sleep(600)
     if what == "memory":
         bytearray(fuzz.MOST_MEMORY + (1 << 22))
     if what == "trace":
         print("Traceback (most recent call last)")
     return 1 if what == "bug" else 3
 
-fuzz.run_command, fuzz.WALL, fuzz.MOST_MEMORY = run, 0.5, 1 << 26
+fuzz.run_command, fuzz.MOST_MEMORY = run, 1 << 26
 words = ("crash", "hang", "memory", "trace", "bug", "fine")
 seeds = {"a": fuzz_seeds.Seed({"a.txt": b"1 2 3"}, "a.txt", tuple((word,) for word in words))}
 one = fuzz.Worker(Path(sys.argv[1]) / "w", seeds)
 for k, word in enumerate(words):
+    fuzz.WALL = 1.0 if word == "hang" else 60.0
     one.order("a", 7, k, 0)
     while (said := one.answer()) is None:
         time.sleep(0.01)

@@ -20,7 +20,7 @@ import numpy as np
 from meshreg.errors import InputError
 from meshreg.io.bridge import bridge
 from meshreg.io.crs import crs_name, crs_text
-from meshreg.io.safe import MissingReferenceError, open_regular, resolve_reference
+from meshreg.io.safe import FARTHEST, MissingReferenceError, open_regular, resolve_reference
 from meshreg.types import Bool, Float64, Grid
 
 log = logging.getLogger("meshreg")
@@ -100,7 +100,7 @@ def _geojson_areas(item: Any, properties: Any) -> Iterator[Area]:
             yield from _geojson_areas(geometry, properties)
     elif kind in ("Polygon", "MultiPolygon"):
         polygons = [item["coordinates"]] if kind == "Polygon" else item["coordinates"]
-        for rings in polygons:
+        for rings in filter(None, polygons):  # empty ones are no geometry (RFC 7946, 3.1)
             yield Area(
                 tuple(_ring([point[:2] for point in ring]) for ring in rings), _use(properties)
             )
@@ -108,8 +108,10 @@ def _geojson_areas(item: Any, properties: Any) -> Iterator[Area]:
 
 def _ring(points: Any) -> Float64:
     ring = np.asarray(points, float)
-    if ring.ndim != 2 or ring.shape[1] != 2 or len(ring) < 3 or not np.isfinite(ring).all():
+    if ring.ndim != 2 or ring.shape[1] != 2 or len(ring) < 3:
         raise ValueError(f"a ring of {len(ring)} points that bounds nothing")
+    if not (np.abs(ring) < FARTHEST).all():
+        raise ValueError(f"a ring with coordinates that are not below {FARTHEST:g}")
     return ring
 
 

@@ -318,6 +318,8 @@ def fuzz(
     failed: list[str] = []
     todo = iter(plain)
     phase, number, running = "plain", said.first, True
+    stopped: list[int] = []
+    signal.signal(signal.SIGINT, lambda number, frame: stopped.append(number))
     while running or any(w.busy for w in workers):
         for one in workers:
             if one.busy is not None:
@@ -346,14 +348,14 @@ def fuzz(
                 continue
             if phase == "plain":
                 following = next(todo, None)
-                if following is not None:
+                if following is not None and not stopped:
                     one.order(*following)
                     continue
                 if any(w.busy for w in workers):
                     continue
                 phase = "changed"
             late = said.seconds is not None and time.monotonic() - start > said.seconds
-            if number >= said.first + count or late:
+            if number >= said.first + count or late or stopped:
                 running = False
                 continue
             one.order(kinds[number % len(kinds)], number, -1, said.seed)

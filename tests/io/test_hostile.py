@@ -225,6 +225,18 @@ def test_a_crs_that_proj_cannot_work_with_is_refused(tmp_path):
     refused(tmp_path / "a.las", "odd", "cannot be worked with")
 
 
+@pytest.mark.parametrize("ring", ["[]", "[[0, 0], [1e300, 0], [0, 1e300]]", "[[0, 0], [1, 1]]"])
+def test_a_mask_that_bounds_nothing_is_refused(tmp_path, ring):
+    from meshreg.io.masks import read_mask
+
+    rings = "[]" if ring == "[]" else f"[{ring}]"
+    path = tmp_path / "m.geojson"
+    path.write_text(f'{{"type": "Polygon", "coordinates": {rings}}}')
+    with pytest.raises(InputError) as caught:
+        read_mask(path, False, "EPSG:32754")
+    assert caught.value.file == str(path)
+
+
 # Texts that are not plain
 
 
