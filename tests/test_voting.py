@@ -165,7 +165,7 @@ def test_any_heading_is_recovered(yaw_deg):
     found = register_pair(survey(21), moving, QUICK)
     assert found.verdict == "accepted", found.reason
     assert found.transform.scale == 1.0
-    assert not found.covariance[6].any()
+    assert 0 < found.covariance[6, 6] < 0.003**2  # a scale that was not fitted is not certain
     assert abs(yaw_of(found.transform) - yaw_deg) < 0.02
     error = found.transform.apply(place(moving)) - truth.apply(place(moving))
     assert np.abs(error).max() < 0.01
@@ -190,7 +190,7 @@ def test_a_wrong_scale_is_named_and_mended(scale):
     assert f"{percent:.1f} % too {'small' if scale > 1 else 'large'}" in found.reason
     assert "check the scale bars" in found.reason
     assert found.transform.scale == pytest.approx(scale, abs=5e-4)
-    assert found.covariance[6, 6] > 0
+    assert found.covariance is None  # no error bar of an answer that is not accepted
     error = found.transform.apply(place(moving)) - truth.apply(place(moving))
     assert np.abs(error)[:2].max() < 0.01
 
