@@ -101,6 +101,8 @@ def run_stoppable(job: Callable[[Unfinished], _T]) -> _T:
             stopped = StoppedError(signals[0])
             if "value" in outcome:  # the job ended before it heard of it
                 stopped.add_note("what was asked for was done already.")
+            for note in getattr(outcome.get("error"), "__notes__", ()):
+                stopped.add_note(note)
             raise stopped
     thread.join()
     if "error" in outcome:

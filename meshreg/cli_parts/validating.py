@@ -78,7 +78,11 @@ def validate(request: ValidateRequest) -> dict[str, Any]:
     pictures = {f"figures/{name}.png": picture for name, picture in drawn.items()}
     require_ours(request.out, tuple(pictures))
     pages = (page.encode("utf-8"), to_json(document).encode("utf-8"))
-    write_into(request.out, {**pictures, **dict(zip(PAGES, pages, strict=True))})
+    try:
+        write_into(request.out, {**pictures, **dict(zip(PAGES, pages, strict=True))})
+    except BaseException as error:
+        error.add_note("some files of the comparison may be new; the registration is as it was.")
+        raise
     remake_report(request.out)
     return document
 
