@@ -21,6 +21,7 @@ RANGES = (0.1, 0.2, 0.4, 0.8, 1.6)  # of the warp, in diagonals of the tiles' pl
 # Of the warp in the variance. Never all of it: a tile is not the smooth warp itself, since the
 # relief that tells its offset is spread unevenly over it, and the warp bends within it.
 SHARES = (0.0, 0.2, 0.5, 0.8, 0.95, 0.99)
+OWN = (0.0, 0.5, 0.9)  # how far what a tile errs by for itself follows what its own fit says
 MOST_TILES = 300  # that the warp's size and range are estimated from
 # Squared deviations of two axes, from what all others say, at which a tile is left out, and up to
 # which it comes back: two numbers, lest it go in and out. Chance would be content with half (1e-4),
@@ -130,6 +131,7 @@ def best_motion(
     yaw_free: bool,
     scale_free: bool = False,
     start: Motion | None = None,
+    noise: Float64 | None = None,
 ) -> Motion:
     """Find the rigid motion that fits all of the ground best; leave out tiles that stand alone.
 
@@ -146,14 +148,17 @@ def best_motion(
         Whether a turn and a stretch are sought too.
     start : Motion, optional
         Whose tiles are used as they are.
+    noise : (M, 2) float64, optional
+        Variance of each tile's east and north in any unit; alike for all where it is not known.
     """
     terms = 4 if scale_free else 2 + yaw_free
+    unlike = np.ones_like(offsets) if noise is None else noise / np.median(noise)
     if start is not None:
-        return _krige(places, offsets, start.used, ground, pivot, terms)[0]
-    used = _near_neighbours(places, offsets)
+        return _krige(places, offsets, unlike, start.used, ground, pivot, terms)[0]
+    used = _near_neighbours(places, offsets / np.sqrt(np.maximum(unlike, 1.0)))
     for _ in range(5):
         before = used
-        motion, used = _krige(places, offsets, used, ground, pivot, terms)
+        motion, used = _krige(places, offsets, unlike, used, ground, pivot, terms)
         if (used == before).all():
             break
     return motion
@@ -183,7 +188,8 @@ class _Fit:
 
     reach: float
     share: float
-    inverse: Float64  # (M, M), of the covariance of one axis in units of `variance`
+    inverse: Float64  # (2, M, M), of the covariance of each axis in units of `variance`
+    alone: Float64  # (M, 2): what each tile errs by for itself, in the same units
     normal: Float64  # (k, k)
     answer: Float64  # (k,)
     left: Float64  # (M, 2)
@@ -192,58 +198,77 @@ class _Fit:
 
     @classmethod
     def of(
-        cls, offsets: Float64, drift: Float64, alike: Float64, reach: float, share: float
+        cls,
+        offsets: Float64,
+        drift: Float64,
+        alike: Float64,
+        reach: float,
+        share: float,
+        alone: Float64,
     ) -> _Fit:
-        covariance = share * alike
-        covariance[np.diag_indices(len(alike))] = 1.0
+        alone = (1.0 - share) * alone
+        covariance = share * alike + np.stack([np.diag(part) for part in alone.T])
         inverse = np.asarray(np.linalg.inv(covariance), np.float64)
-        weighed = np.tensordot(inverse, drift, 1)
+        weighed = np.stack([inverse[axis] @ drift[:, axis] for axis in (0, 1)], axis=1)
         normal = np.einsum("mik,mil->kl", drift, weighed)
         answer = np.linalg.solve(normal, np.einsum("mik,mi->k", weighed, offsets))
         left = offsets - drift @ answer
         freedom = offsets.size - len(answer)
-        variance = float((left * (inverse @ left)).sum()) / freedom
+        variance = float(np.einsum("mi,imn,ni->", left, inverse, left, optimize=True)) / freedom
         variance = max(variance, 1e-24)
-        volume = 2 * np.linalg.slogdet(covariance)[1] + np.linalg.slogdet(normal)[1]
+        volume = np.linalg.slogdet(covariance)[1].sum() + np.linalg.slogdet(normal)[1]
         cost = freedom * np.log(variance) + volume
-        return cls(reach, share, inverse, normal, answer, left, variance, float(cost))
+        return cls(reach, share, inverse, alone, normal, answer, left, variance, float(cost))
+
+    @property
+    def pulls(self) -> Float64:
+        """(M, 2): the inverse covariance times what is left."""
+        return np.stack([self.inverse[axis] @ self.left[:, axis] for axis in (0, 1)], axis=1)
 
 
 def _krige(
     places: Float64,
     offsets: Float64,
+    unlike: Float64,
     used: Bool,
     ground: Ground,
     pivot: Float64,
     terms: int,
 ) -> tuple[Motion, Bool]:
     """Average over all likely reaches and shares of the warp; also tell which tiles fit."""
-    here, there = places[used], offsets[used]
+    here, there, unlike_here = places[used], offsets[used], unlike[used]
     drift = design(here, pivot, terms)
     diagonal = float(np.hypot(*np.ptp(places, axis=0)))
     thin = slice(None, None, -(-len(here) // MOST_TILES))
+    owns = OWN if np.ptp(unlike) > 0 else OWN[:1]
     tries = []
     for reach in diagonal * np.array(RANGES):
         alike = correlation(here[thin], here[thin], reach)
         for share in SHARES if reach == diagonal * RANGES[0] else SHARES[1:]:
-            tries.append(_Fit.of(there[thin], drift[thin], alike, float(reach), share))
-    odds = np.exp(-0.5 * (np.array([t.cost for t in tries]) - min(t.cost for t in tries)))
+            for own in owns:
+                alone = 1.0 + own * (unlike_here[thin] - 1.0)
+                fit = _Fit.of(there[thin], drift[thin], alike, float(reach), share, alone)
+                tries.append((fit, own))
+    cost = np.array([fit.cost for fit, _ in tries])
+    odds = np.exp(-0.5 * (cost - cost.min()))
     odds /= odds.sum()
     found = []
-    for weight, fit in zip(odds, tries, strict=True):
+    for weight, (fit, own) in zip(odds, tries, strict=True):
         if weight > 1e-3:
             whole = fit
             if len(here[thin]) < len(here):
                 alike = correlation(here, here, fit.reach)
-                whole = _Fit.of(there, drift, alike, fit.reach, fit.share)
-            found.append((weight, whole, *_over_ground(whole, here, drift, ground, pivot)))
+                alone = 1.0 + own * (unlike_here - 1.0)
+                whole = _Fit.of(there, drift, alike, fit.reach, fit.share, alone)
+            found.append((weight, (whole, own), *_over_ground(whole, here, drift, ground, pivot)))
     total = sum(weight for weight, *_ in found)
     answer = sum(weight * a for weight, _, a, _ in found) / total
     covariance = sum(w * (c + np.outer(a - answer, a - answer)) for w, _, a, c in found) / total
-    best = max(found, key=lambda entry: entry[0])[1]
-    weights = best.share * best.inverse @ best.left
-    field = Field(here, pivot, best.answer, weights, best.reach)
-    return Motion(answer, covariance, used, field), _fitting(best, places, offsets, used, pivot)
+    best, own = max(found, key=lambda entry: entry[0])[1]
+    field = Field(here, pivot, best.answer, best.share * best.pulls, best.reach)
+    alone = (1.0 - best.share) * (1.0 + own * (unlike - 1.0))
+    fits = _fitting(best, places, offsets, alone, used, pivot)
+    return Motion(answer, covariance, used, field), fits
 
 
 def _over_ground(
@@ -259,7 +284,7 @@ def _over_ground(
     near = fit.share * correlation(ground.places, places, fit.reach)
     within = fit.share * correlation(ground.places, ground.places, fit.reach)
     known = weights @ near  # (2, k, M): covariance of the answer with each tile
-    gain = known @ fit.inverse
+    gain = known @ fit.inverse  # axis by axis
     answer = fit.answer + sum(gain[axis] @ fit.left[:, axis] for axis in (0, 1))
     rest = np.eye(drift.shape[2]) - sum(gain[axis] @ drift[:, axis] for axis in (0, 1))
     covariance = rest @ np.linalg.solve(fit.normal, rest.T)
@@ -268,17 +293,19 @@ def _over_ground(
     return answer, fit.variance * 0.5 * (covariance + covariance.T)
 
 
-def _fitting(fit: _Fit, places: Float64, offsets: Float64, used: Bool, pivot: Float64) -> Bool:
+def _fitting(
+    fit: _Fit, places: Float64, offsets: Float64, alone: Float64, used: Bool, pivot: Float64
+) -> Bool:
     """Tell which tiles lie where all the others, drift and warp, expect them."""
     here = places[used]
     drift = design(here, pivot, len(fit.answer))
-    weighed = np.tensordot(fit.inverse, drift, 1)
+    weighed = np.stack([fit.inverse[axis] @ drift[:, axis] for axis in (0, 1)], axis=1)
     # leave-one-out (Dubrule, Mathematical Geology 15, 1983): (P d)_m / P_mm, of variance s²/P_mm
-    inner = np.diag(fit.inverse)[:, None] - np.einsum(
+    inner = np.diagonal(fit.inverse, axis1=1, axis2=2).T - np.einsum(
         "mik,kl,mil->mi", weighed, np.linalg.inv(fit.normal), weighed
     )
-    alone = fit.inverse @ fit.left
-    deviation = (alone**2 / np.maximum(inner, 1e-12)).sum(axis=1) / fit.variance
+    pulls = fit.pulls
+    deviation = (pulls**2 / np.maximum(inner, 1e-12)).sum(axis=1) / fit.variance
     scale = max(float(np.median(deviation)) / (2 * np.log(2)), 1e-12)
     # the left-out ones are judged from the kept ones, as any other place would be
     result = np.zeros(len(used), bool)
@@ -286,11 +313,11 @@ def _fitting(fit: _Fit, places: Float64, offsets: Float64, used: Bool, pivot: Fl
     out = ~used
     if out.any():
         near = fit.share * correlation(places[out], here, fit.reach)
-        expected = design(places[out], pivot, len(fit.answer)) @ fit.answer
-        expected += near @ alone
-        variance = 1.0 - ((near @ fit.inverse) * near).sum(axis=1)
-        away = ((offsets[out] - expected) ** 2).sum(axis=1)
-        result[out] = away <= RETURN * scale * fit.variance * np.maximum(variance, 1e-12)
+        expected = design(places[out], pivot, len(fit.answer)) @ fit.answer + near @ pulls
+        told = np.stack([((near @ part) * near).sum(axis=1) for part in fit.inverse], axis=1)
+        variance = np.maximum(fit.share + alone[out] - told, 1e-12)
+        away = ((offsets[out] - expected) ** 2 / variance).sum(axis=1)
+        result[out] = away <= RETURN * scale * fit.variance
     return result if result.sum() >= 0.5 * used.sum() else used
 
 

@@ -16,10 +16,11 @@ import numpy as np
 
 from meshreg.kriging import Ground, best_motion, design, overlap_ground
 from meshreg.offsets import neutral
+from meshreg.offsets.channels import smooth
 from meshreg.offsets.surface import MAD_TO_SIGMA
 from meshreg.sandwich import block_sandwich
 from meshreg.tiles import MAX_YAW, Relief, TileOffsets, correlated_tiles, polished_tiles
-from meshreg.types import Float64, OffsetAt, SurveyRaster
+from meshreg.types import Bool, Float64, OffsetAt, SurveyRaster
 
 MIN_TILES = 6
 LEAST_FOR_SCALE = 12  # tiles, for a scale of their own
@@ -32,6 +33,7 @@ HONEST_SIDE = 45
 # Cells: what sampling alone leaves open, alike for all tiles, so that their scatter does not show
 # it; for peaks of correlation (a parabola through whole cells leans towards them), and polished.
 PEAK_RESOLUTION, RESOLUTION = 0.05, 0.005
+RELIEF_CELLS = 5.0  # of an image: its surroundings, as the judge's local contrast sees them
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,25 +102,29 @@ def refine(
     ground = dem_ground(rasters[0][0], rasters[0][1], offset)
     centre = ground.share @ ground.places
     coarse = Refined(centre, np.array(offset), 0.0, _block_diagonal(sigma, MAX_YAW**2 / 9))
-    tiles = _joined([correlated_tiles(a, b, channel, offset, fields) for a, b, channel in rasters])
+    found = [correlated_tiles(a, b, channel, offset, fields) for a, b, channel in rasters]
+    tiles = _joined(found)
     if not _enough(tiles):
         return replace(coarse, note="too few tiles match on their own to measure yaw")
     assert tiles is not None
     rough = fit(tiles, centre)
-    assert rough.weights is not None
-    kept = tiles.only(rough.weights > 0)
-    if _enough(kept):
-        best = over_ground(kept, ground, centre)
-    else:
-        best = replace(rough, covariance=misfit(tiles) * rough.covariance)
-    cells = [moving.grid.cell for _, moving, _ in rasters]
-    best = _stated(best, PEAK_RESOLUTION * max(cells))
-    for reference, moving, channel in rasters:
+    answers = []
+    for (reference, moving, channel), own in zip(rasters, found, strict=True):
+        cell = moving.grid.cell
+        answer = _of_peaks(own, rough, ground, PEAK_RESOLUTION * cell)
         if channel == "terrain":
             finer = _polished(reference, moving, ground, rough)
-            finer = None if finer is None else _stated(finer, RESOLUTION * moving.grid.cell)
-            if finer is not None and _size(finer) < _size(best):
-                best = _with_surer_yaw(finer, best)
+            if finer is not None:
+                finer = _stated(finer, RESOLUTION * cell)
+                answer = finer if answer is None else blended(finer, answer)
+        elif answer is not None:
+            answer = _stated(answer, relief_height(reference, moving))
+        answers += [] if answer is None else [answer]
+    if answers:
+        best = answers[0] if len(answers) == 1 else combined(*answers)
+    else:  # neither channel has enough tiles of its own
+        best = replace(rough, covariance=misfit(tiles) * rough.covariance)
+        best = _stated(best, PEAK_RESOLUTION * max(moving.grid.cell for _, moving, _ in rasters))
     if abs(best.yaw) > MAX_YAW:
         turn = np.rad2deg(best.yaw)
         return replace(coarse, doubt=f"the surveys are turned by about {turn:.1f}°, beyond ±1°")
@@ -126,6 +132,98 @@ def refine(
     if moved > agree:
         return replace(coarse, doubt=f"tiles alone lie {moved:.2f} m from the whole's offset")
     return best
+
+
+def _of_peaks(
+    tiles: TileOffsets | None, rough: Refined, ground: Ground, resolution: float
+) -> Refined | None:
+    """Rigid answer of one channel's peaks of correlation that the rough fit can explain."""
+    if not _enough(tiles):
+        return None
+    assert tiles is not None
+    kept = tiles.only(_explained(tiles, rough))
+    if not _enough(kept):
+        return None
+    return _stated(over_ground(kept, ground, rough.pivot), resolution)
+
+
+def _explained(tiles: TileOffsets, rough: Refined) -> Bool:
+    """Tell which tiles lie within four robust deviations of their channel's own rigid fit."""
+    weights = fit(tiles, rough.pivot).weights
+    assert weights is not None
+    return np.asarray(weights > 0)
+
+
+def relief_height(reference: SurveyRaster, moving: SurveyRaster) -> float:
+    """Rms height [m] of both surveys' ground about its surroundings (`RELIEF_CELLS`).
+
+    By so much light can displace what an image shows: a shadow's edge lies a height away from the
+    edge that casts it where the light stands at 45°, on its other side if the light does; and all
+    tiles are displaced alike, so that their scatter does not tell. 0 where nothing has a height.
+    """
+    squares = []
+    for raster in (reference, moving):
+        mask = raster.valid
+        if mask.any():
+            height = raster.height.astype(np.float64)
+            height = np.where(mask, height - np.median(height[mask]), 0.0)
+            squares.append(np.mean((height - smooth(height, mask, RELIEF_CELLS))[mask] ** 2))
+    return float(np.sqrt(np.mean(squares))) if squares else 0.0
+
+
+def combined(first: Refined, second: Refined) -> Refined:
+    """Answer of two independent channels, each weighed by its covariance.
+
+    What they differ by beyond their covariances is an error of one of them, and nothing says of
+    which: the more probable the one is, the less of it is the answer's (the variance between two
+    hypotheses, ``p (1 - p) d d'``, with p as the weights are), and it goes in with the share that
+    chance does not explain, as a random effect (DerSimonian and Laird, Controlled Clinical Trials
+    7, 1986). No step in the covariances or the offsets makes the answer jump.
+    """
+    inverse = [np.linalg.inv(r.covariance) for r in (first, second)]
+    covariance = np.linalg.inv(inverse[0] + inverse[1])
+    values = [np.append(r.offset, r.yaw) for r in (first, second)]
+    answer = covariance @ (inverse[0] @ values[0] + inverse[1] @ values[1])
+    return _between(first, second, answer, 0.5 * (covariance + covariance.T), 1)
+
+
+def blended(finer: Refined, coarser: Refined) -> Refined:
+    """Answer of two readings of the same ground: the surer one nearly alone, yet without a jump.
+
+    They do not support each other, so that the covariance is no smaller than theirs.
+    """
+    weight = _size(coarser) ** 2 / (_size(finer) ** 2 + _size(coarser) ** 2)
+    values = [np.append(r.offset, r.yaw) for r in (finer, coarser)]
+    answer = weight * values[0] + (1 - weight) * values[1]
+    covariance = weight * finer.covariance + (1 - weight) * coarser.covariance
+    return _between(finer, coarser, answer, covariance, 2)
+
+
+def _between(
+    first: Refined, second: Refined, answer: Float64, covariance: Float64, power: int
+) -> Refined:
+    """Add to the covariance what two answers differ by beyond chance; keep the surer's tiles."""
+    apart = np.append(first.offset - second.offset, first.yaw - second.yaw)
+    sizes = np.array([_size(first), _size(second)]) ** power
+    weights = sizes[::-1] / sizes.sum()
+    both = first.covariance + second.covariance
+    chance = 2.0 / max(float(apart[:2] @ np.linalg.solve(both[:2, :2], apart[:2])), 2.0)
+    of_yaw = 1.0 / max(float(apart[2] ** 2 / both[2, 2]), 1.0)
+    apart *= np.sqrt(1.0 - np.array([chance, chance, of_yaw]))
+    covariance = covariance + weights.prod() * np.outer(apart, apart)
+    surer = first if weights[0] >= weights[1] else second
+    assert surer.offset_at is not None
+    step = replace(surer, offset=answer[:2] - surer.offset, yaw=float(answer[2]) - surer.yaw)
+    whole: OffsetAt = partial(_moved, surer.offset_at, step)
+    moved = replace(
+        surer, offset=answer[:2], yaw=float(answer[2]), covariance=covariance, offset_at=whole
+    )
+    return _with_residuals(moved)
+
+
+def _moved(offset_at: OffsetAt, step: Refined, places: Float64) -> Float64:
+    """Offsets (N, 2) [m] of a field that a rigid step moves."""
+    return np.asarray(offset_at(places) + _rigid(step, places))
 
 
 def _stated(refined: Refined, resolution: float) -> Refined:
@@ -168,20 +266,26 @@ def over_ground(tiles: TileOffsets, ground: Ground, pivot: Float64) -> Refined:
     were left out are not: what counts as ground that has not changed is a choice.
     """
     places, offsets = tiles.places, tiles.offsets
-    motion = best_motion(places, offsets, ground, pivot, yaw_free=True)
+    motion = best_motion(places, offsets, ground, pivot, yaw_free=True, noise=tiles.noise)
     either = motion.answer
     share = ground.share * np.clip(motion.field.growth(ground.places), 0.5, 2.0)
     ground = replace(ground, share=share / share.sum())
-    motion = best_motion(places, offsets, ground, pivot, yaw_free=True, start=motion)
+    motion = best_motion(
+        places, offsets, ground, pivot, yaw_free=True, start=motion, noise=tiles.noise
+    )
     everything = motion
     if not motion.used.all():
         everything = replace(motion, used=np.ones(len(places), bool))
-        everything = best_motion(places, offsets, ground, pivot, yaw_free=True, start=everything)
+        everything = best_motion(
+            places, offsets, ground, pivot, yaw_free=True, start=everything, noise=tiles.noise
+        )
     half, choice = 0.5 * (motion.answer - either), everything.answer - motion.answer
     covariance, yaw = motion.covariance, float(motion.answer[2])
     offset = motion.answer[:2]
     if abs(yaw) <= 2 * np.sqrt(covariance[2, 2]):
-        still = best_motion(places, offsets, ground, pivot, yaw_free=False, start=motion)
+        still = best_motion(
+            places, offsets, ground, pivot, yaw_free=False, start=motion, noise=tiles.noise
+        )
         yaw, offset = 0.0, still.answer
         covariance = _block_diagonal(still.covariance, covariance[2, 2])
     covariance = misfit(tiles) * covariance + np.outer(half, half) + np.outer(choice, choice)
@@ -200,7 +304,13 @@ def with_scale(refined: Refined, ground: Ground) -> tuple[Refined, float]:
     if tiles is None or len(tiles.places) < LEAST_FOR_SCALE:
         return replace(refined, scale_variance=UNKNOWN_SCALE**2), 1.0
     motion = best_motion(
-        tiles.places, tiles.offsets, ground, refined.pivot, yaw_free=True, scale_free=True
+        tiles.places,
+        tiles.offsets,
+        ground,
+        refined.pivot,
+        yaw_free=True,
+        scale_free=True,
+        noise=tiles.noise,
     )
     similar = motion.answer[2:] + np.array([0.0, 1.0])  # s sin psi, s cos psi
     scale = float(np.hypot(*similar))
@@ -219,19 +329,6 @@ def _with_residuals(refined: Refined) -> Refined:
     assert refined.tiles is not None
     left = refined.tiles.offsets - _rigid(refined, refined.tiles.places)
     return replace(refined, residuals=left)
-
-
-def _with_surer_yaw(refined: Refined, other: Refined) -> Refined:
-    """Take the yaw of another answer that is twice as sure of it.
-
-    Peaks of correlation may all lean the same way, which turns nothing.
-    """
-    if other.covariance[2, 2] > 0.25 * refined.covariance[2, 2]:
-        return refined
-    covariance = refined.covariance.copy()
-    covariance[2], covariance[:, 2] = 0.0, 0.0
-    covariance[2, 2] = other.covariance[2, 2]
-    return _with_residuals(replace(refined, yaw=other.yaw, covariance=covariance))
 
 
 def _enough(tiles: TileOffsets | None) -> bool:

@@ -18,7 +18,11 @@ MAD_TO_SIGMA = 1.4826
 def polish(
     still: Any, moved: Any, places: Any, bounds: Any, sizes: Any, origin: Any, cell: float
 ) -> Any:
-    """Offsets [m] to add to the tiles' own so that they fit, (M, 2); NaN where one does not.
+    """What to add to the tiles' offsets so that they fit, and how sure that is: (M, 4).
+
+    East and north [m], and the variance of each [m²] that the misfit of single cells leaves, as if
+    each erred alone: it says by how much one tile is better known than another. NaN where a tile
+    does not fit.
 
     Parameters
     ----------
@@ -35,15 +39,15 @@ def polish(
     cell : float
     """
     tiles = len(bounds) - 1
-    answers = np.full((tiles, 2), np.nan)
+    answers = np.full((tiles, 4), np.nan)
     for tile in prange(tiles):
         number = np.int64(tile)
         first, last = bounds[number], bounds[number + 1]
         if last - first >= 0.5 * sizes[number]:
             part = places[first:last]
-            east, north = _fitted(still, moved, part, origin, cell)
-            answers[number, 0] = east
-            answers[number, 1] = north
+            found = _fitted(still, moved, part, origin, cell)
+            for k in range(4):
+                answers[number, k] = found[k]
     return answers
 
 
@@ -53,13 +57,14 @@ def _fitted(still: Any, moved: Any, places: Any, origin: Any, cell: float) -> An
     residual, weight = np.empty(count), np.empty(count)
     slopes = np.empty((count, 2))
     east, north, step_east, step_north = 0.0, 0.0, np.inf, np.inf
+    var_east, var_north = np.inf, np.inf
     for _ in range(STEPS):
         edge = (origin[0] - east, origin[1] - north)
         used = _residuals(still, moved, places, edge, cell, residual, slopes)
         if used < 0.5 * count:
-            return np.nan, np.nan
+            return np.nan, np.nan, np.nan, np.nan
         _biweight(residual[:used], weight[:used])
-        a, b, d, p, q = 0.0, 0.0, 0.0, 0.0, 0.0
+        a, b, d, p, q, total, misfit = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         for k in range(used):
             x, y = slopes[k, 0], slopes[k, 1]
             a += weight[k] * x * x
@@ -67,10 +72,13 @@ def _fitted(still: Any, moved: Any, places: Any, origin: Any, cell: float) -> An
             d += weight[k] * y * y
             p += weight[k] * x * residual[k]
             q += weight[k] * y * residual[k]
+            total += weight[k]
+            misfit += weight[k] * residual[k] * residual[k]
         middle, reach = 0.5 * (a + d), np.hypot(0.5 * (a - d), b)
         if not middle + reach < ONE_WAY * (middle - reach):
-            return np.nan, np.nan
+            return np.nan, np.nan, np.nan, np.nan
         determinant = a * d - b * b
+        var_east, var_north = misfit / total * d / determinant, misfit / total * a / determinant
         step_east = (b * q - d * p) / determinant
         step_north = (b * p - a * q) / determinant
         east += step_east
@@ -78,8 +86,8 @@ def _fitted(still: Any, moved: Any, places: Any, origin: Any, cell: float) -> An
         if max(abs(step_east), abs(step_north)) < STILL:
             break
     if np.hypot(east, north) <= 3 * cell and max(abs(step_east), abs(step_north)) < 0.01 * cell:
-        return east, north
-    return np.nan, np.nan
+        return east, north, var_east, var_north
+    return np.nan, np.nan, np.nan, np.nan
 
 
 @jit()

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from meshreg.offsets import correlate, neutral
-from meshreg.offsets.channels import high_pass
+from meshreg.offsets.channels import smooth
 from meshreg.offsets.correlate import Correlator, Window
 from meshreg.offsets.error_bars import whole_shift
 from meshreg.offsets.surface import find_peak
@@ -42,6 +42,8 @@ class TileOffsets:
         Which of the channels matched it.
     side : int
         Cells along a tile's side.
+    noise : (M, 2) float64 or None
+        Variance of each tile's east and north, in units that all tiles share; None: alike.
     """
 
     places: Float64
@@ -49,11 +51,13 @@ class TileOffsets:
     block: np.ndarray
     channel: np.ndarray
     side: int = TILE_CELLS
+    noise: Float64 | None = None
 
     def only(self, keep: Bool) -> TileOffsets:
         """Return the tiles where `keep` (M,) is True."""
         block, channel = self.block[keep], self.channel[keep]
-        return TileOffsets(self.places[keep], self.offsets[keep], block, channel, self.side)
+        noise = None if self.noise is None else self.noise[keep]
+        return TileOffsets(self.places[keep], self.offsets[keep], block, channel, self.side, noise)
 
 
 @dataclass(frozen=True)
@@ -214,8 +218,9 @@ def polished_tiles(
     middle = np.array(tiles, float)[found].T + 0.5 * (side - 1)
     places = np.stack(moving.grid.east_north(*middle), axis=1)
     number = len(places)
-    offsets = bend.at(middle) + added[found]
-    return TileOffsets(places, offsets, np.arange(number), np.zeros(number, int), side)
+    offsets = bend.at(middle) + added[found, :2]
+    noise = added[found, 2:]
+    return TileOffsets(places, offsets, np.arange(number), np.zeros(number, int), side, noise)
 
 
 def _known_cells(
@@ -285,7 +290,7 @@ class Relief:
         mask = raster.valid
         height = raster.height.astype(np.float64)
         height = np.where(mask, height - (np.median(height[mask]) if mask.any() else 0.0), 0.0)
-        field = high_pass(height, mask, HIGH_PASS)
+        field = np.where(mask, height - smooth(height, mask, HIGH_PASS), 0.0)
         d_row, d_col = (np.asarray(d, np.float64) for d in np.gradient(field))
         inner = binary_erosion(mask, iterations=3, border_value=0)
         cell = raster.grid.cell
