@@ -29,6 +29,10 @@ from meshreg.sandwich import block_sandwich
 from meshreg.types import Bool, Float64, Transform, UInt8
 
 MIN_BLOCKS = 12
+# m: algal turf is lower than 2 cm by definition (Steneck and Dethier, Oikos 69, 1994; Connell et al.,
+# Marine Ecology Progress Series 495, 2014), and half of that in the mean between none and all of it
+COVER = 0.015
+NODES = 300  # places that stand for the ground, seen or not
 LEAST_STEP = 0.1  # cells: what parts two blocks that did not change alike is higher than that
 # What a cell of ground was for the height and the tilt: not compared; changed, or without detail
 # that recurs; in a block that changed as a whole, which is told by its neighbours; counted.
@@ -54,9 +58,11 @@ class GroundPlane:
     terms : int
         Of the bending that `depart` is free of.
     choice : float
-        Change of up if nothing is left out [m].
+        Change of up if all the ground counts whose detail recurs [m].
     unseen : float
-        What the bending may do where no ground counts [m].
+        What the bending may do where no ground counts, to the tilt [m].
+    beside : float
+        Deviation of the bending's mean over all ground from that over the ground that counts [m].
     leverage : (3, 3) float64
         What an error of 1 m does to the step if it is as bad as can be.
     kept : float
@@ -76,6 +82,7 @@ class GroundPlane:
     terms: int
     choice: float
     unseen: float
+    beside: float
     leverage: Float64
     kept: float
     sigma: float
@@ -88,14 +95,14 @@ class GroundPlane:
         makes that err. A tilt hangs on the rim, and with it on how the models bend there. What
         covers the ground is one-sided (turf and crusts add, wear takes away), and no height
         difference tells its mean from up: what covers half the ground has a mean as large as its
-        spread, and blocks show that spread.
+        spread, and blocks show that spread; but what keeps the detail beneath it is thin (`COVER`).
         """
         covariance, alone = self._bending.copy(), self._sandwich(self.noise)
         if covariance[0, 0] > alone[0, 0]:
             less = np.sqrt(alone[0, 0] / covariance[0, 0])
             covariance[0] *= less
             covariance[:, 0] *= less
-        covariance[0, 0] += max(self.choice**2, self.sigma**2)
+        covariance[0, 0] += max(self.choice**2, min(self.sigma, COVER) ** 2)
         return covariance + self._hidden(sheet)
 
     def tells(self, tilt: Float64, sheet: float = 0.0) -> bool:
@@ -114,7 +121,10 @@ class GroundPlane:
         return self._sandwich(self.depart)
 
     def _hidden(self, sheet: float) -> Float64:
-        return (self.unseen**2 + sheet**2) * self.leverage
+        hidden = self.unseen**2 * self.leverage
+        hidden[0] = hidden[:, 0] = 0.0  # up is stated at the middle of all ground
+        hidden[0, 0] = self.beside**2
+        return hidden + sheet**2 * self.leverage
 
     def _sandwich(self, errors: Float64) -> Float64:
         curvature = (self.design * self.weight[:, None]).T @ self.design
@@ -215,6 +225,7 @@ def fit_plane(
     design, everywhere = _design(blocks.arm), _design(arm)
     step = least_squares(design, weight, value)
     bending = float(np.sqrt(np.average((value - design @ step) ** 2, weights=weight)))
+    left = np.where(wild, np.nan, value - design @ step)
     if not tilted:
         step = np.array([np.average(value, weights=weight), 0.0, 0.0])
     hidden = 1.0 - float(weight.sum()) / len(arm)
@@ -227,8 +238,9 @@ def fit_plane(
         noise=np.where(wild, 0.0, rest - around),
         lattice=lattice,
         terms=terms,
-        choice=float(np.median(difference - everywhere @ step)),
+        choice=float(np.median((difference - everywhere @ step)[pair.counts])),
         unseen=hidden * bending * _wider(arm, blocks.arm, weight, blocks.width),
+        beside=_between_means(lattice, left, blocks, arm, weight),
         leverage=np.asarray(leverage, np.float64),
         kept=float((blocks.agreed * weight)[~wild].sum() / len(arm)),
         sigma=sigma,
@@ -254,6 +266,42 @@ def _wider(every: Float64, seen: Float64, weight: Float64, width: float) -> floa
     narrow = (seen * weight[:, None]).T @ seen / weight.sum() + width**2 / 12 * np.eye(2)
     ratio = eigh(every.T @ every / len(every), narrow, eigvals_only=True)
     return max(1.0, float(np.sqrt(ratio[-1])))
+
+
+def _between_means(
+    lattice: Index, left: Float64, blocks: _Blocks, arm: Float64, weight: Float64
+) -> float:
+    """Deviation [m] of a mean of the bending over all ground from that over the blocks' ground.
+
+    The bending as a random field with an exponential correlation: its variance and length are those
+    of what blocks and their next neighbours have in common, which their own errors are no part of
+    (variance of the difference of two block means; Cressie, Statistics for Spatial Data, 1993,
+    section 2.4).
+    """
+    from scipy.spatial.distance import cdist
+
+    table = np.full(lattice.max(axis=0) + 1, np.nan)
+    table[tuple(lattice.T)] = left
+    common = []
+    for lag in range(1, max(2, min(table.shape) // 2)):
+        pairs = [table[lag:] * table[:-lag], table[:, lag:] * table[:, :-lag]]
+        products = np.concatenate([p[np.isfinite(p)] for p in pairs])
+        common.append(float(products.mean()) if products.size else 0.0)
+    if not common[0] > 0:
+        return 0.0
+    fallen = [k for k, value in enumerate(common) if value < common[0] / np.e]
+    length = (fallen[0] if fallen else len(common)) * blocks.width
+    variance = common[0] * np.exp(blocks.width / length)
+    every = arm[:: -(-len(arm) // NODES)]
+    seen = np.flatnonzero(weight > 0)[:: -(-len(weight) // NODES)]
+    share = weight[seen] / weight[seen].sum()
+    mine, other = blocks.arm[seen], np.full(len(every), 1 / len(every))
+    apart = (
+        other @ np.exp(-cdist(every, every) / length) @ other
+        + share @ np.exp(-cdist(mine, mine) / length) @ share
+        - 2 * other @ np.exp(-cdist(every, mine) / length) @ share
+    )
+    return float(np.sqrt(max(variance * apart, 0.0)))
 
 
 def _states(pair: DemPair, blocks: _Blocks, wild: Bool) -> UInt8:
