@@ -29,9 +29,10 @@ from meshreg.sandwich import block_sandwich
 from meshreg.types import Bool, Float64, Transform, UInt8
 
 MIN_BLOCKS = 12
-# m: algal turf is lower than 2 cm by definition (Steneck and Dethier, Oikos 69, 1994; Connell et al.,
-# Marine Ecology Progress Series 495, 2014), and half of that in the mean between none and all of it
-COVER = 0.015
+# m: algal turf on reefs is mostly lower than 2 cm (Connell, Foster and Airoldi, Marine Ecology
+# Progress Series 495, 2014). Its mean may have grown or gone by anything up to that: the deviation
+# of a rectangular distribution (Guide to the Expression of Uncertainty in Measurement, 4.3.7).
+COVER = 0.02 / np.sqrt(3)
 NODES = 300  # places that stand for the ground, seen or not
 LEAST_STEP = 0.1  # cells: what parts two blocks that did not change alike is higher than that
 # What a cell of ground was for the height and the tilt: not compared; changed, or without detail
@@ -96,13 +97,14 @@ class GroundPlane:
         covers the ground is one-sided (turf and crusts add, wear takes away), and no height
         difference tells its mean from up: what covers half the ground has a mean as large as its
         spread, and blocks show that spread; but what keeps the detail beneath it is thin (`COVER`).
+        The truth is up or what up is with nothing left out, or anything between.
         """
         covariance, alone = self._bending.copy(), self._sandwich(self.noise)
         if covariance[0, 0] > alone[0, 0]:
             less = np.sqrt(alone[0, 0] / covariance[0, 0])
             covariance[0] *= less
             covariance[:, 0] *= less
-        covariance[0, 0] += max(self.choice**2, min(self.sigma, COVER) ** 2)
+        covariance[0, 0] += max(self.choice**2 / 3, min(self.sigma, COVER) ** 2)
         return covariance + self._hidden(sheet)
 
     def tells(self, tilt: Float64, sheet: float = 0.0) -> bool:
@@ -226,6 +228,7 @@ def fit_plane(
     step = least_squares(design, weight, value)
     bending = float(np.sqrt(np.average((value - design @ step) ** 2, weights=weight)))
     left = np.where(wild, np.nan, value - design @ step)
+    wider = _wider(arm, blocks.arm, weight, blocks.width)
     if not tilted:
         step = np.array([np.average(value, weights=weight), 0.0, 0.0])
     hidden = 1.0 - float(weight.sum()) / len(arm)
@@ -239,8 +242,8 @@ def fit_plane(
         lattice=lattice,
         terms=terms,
         choice=float(np.median((difference - everywhere @ step)[pair.counts])),
-        unseen=hidden * bending * _wider(arm, blocks.arm, weight, blocks.width),
-        beside=_between_means(lattice, left, blocks, arm, weight),
+        unseen=hidden * bending * float(wider.max()),
+        beside=np.sqrt(wider.mean()) * _between_means(lattice, left, blocks, arm, weight),
         leverage=np.asarray(leverage, np.float64),
         kept=float((blocks.agreed * weight)[~wild].sum() / len(arm)),
         sigma=sigma,
@@ -253,11 +256,12 @@ def _design(arm: Float64) -> Float64:
     return np.column_stack([np.ones(len(arm)), arm[:, 1], -arm[:, 0]])
 
 
-def _wider(every: Float64, seen: Float64, weight: Float64, width: float) -> float:
-    """By how much more all the ground departs from a plane than the ground that counts shows.
+def _wider(every: Float64, seen: Float64, weight: Float64, width: float) -> Float64:
+    """By how many times all the ground is wider than the ground that counts, along two axes (2,).
 
     Bends grow with the width over which they are seen: rough ones by its root, a dome by its
-    square. Taken as the width itself, where the ground that counts is the narrowest beside all.
+    square. The tilt takes the width itself where the ground that counts is the narrowest beside
+    all; up the root, of both axes together, since its random field is a rough one.
     """
     from scipy.linalg import eigh
 
@@ -265,7 +269,7 @@ def _wider(every: Float64, seen: Float64, weight: Float64, width: float) -> floa
     every, seen = every - middle, seen - middle
     narrow = (seen * weight[:, None]).T @ seen / weight.sum() + width**2 / 12 * np.eye(2)
     ratio = eigh(every.T @ every / len(every), narrow, eigvals_only=True)
-    return max(1.0, float(np.sqrt(ratio[-1])))
+    return np.asarray(np.sqrt(np.maximum(ratio, 1.0)))
 
 
 def _between_means(

@@ -118,7 +118,9 @@ def refine(
                 finer = _stated(finer, RESOLUTION * cell)
                 answer = finer if answer is None else blended(finer, answer)
         elif answer is not None:
-            answer = _stated(answer, relief_height(reference, moving))
+            light = relief_height(reference, moving)
+            apart = 2 * np.sqrt(ground.share @ ((ground.places - centre) ** 2).sum(axis=1))
+            answer = _stated(answer, light, light / apart)  # one side displaced, the other not
         answers += [] if answer is None else [answer]
     if answers:
         best = answers[0] if len(answers) == 1 else combined(*answers)
@@ -211,6 +213,9 @@ def _between(
     of_yaw = 1.0 / max(float(apart[2] ** 2 / both[2, 2]), 1.0)
     apart *= np.sqrt(1.0 - np.array([chance, chance, of_yaw]))
     covariance = covariance + weights.prod() * np.outer(apart, apart)
+    if abs(answer[2]) <= 2 * np.sqrt(covariance[2, 2]):  # as `over_ground`
+        answer[2] = 0.0
+        covariance = _block_diagonal(covariance[:2, :2], covariance[2, 2])
     surer = first if weights[0] >= weights[1] else second
     assert surer.offset_at is not None
     step = replace(surer, offset=answer[:2] - surer.offset, yaw=float(answer[2]) - surer.yaw)
@@ -226,9 +231,9 @@ def _moved(offset_at: OffsetAt, step: Refined, places: Float64) -> Float64:
     return np.asarray(offset_at(places) + _rigid(step, places))
 
 
-def _stated(refined: Refined, resolution: float) -> Refined:
-    """Add to the covariance what the scatter of tiles does not show; `resolution` is in metres."""
-    floor = np.diag([resolution**2, resolution**2, 0.0])
+def _stated(refined: Refined, resolution: float, turn: float = 0.0) -> Refined:
+    """Add to the covariance what the scatter of tiles does not show, in metres and radians."""
+    floor = np.diag([resolution**2, resolution**2, turn**2])
     return replace(refined, covariance=refined.covariance + floor)
 
 

@@ -18,7 +18,7 @@ MAD_TO_SIGMA = 1.4826
 def polish(
     still: Any, moved: Any, places: Any, bounds: Any, sizes: Any, origin: Any, cell: float
 ) -> Any:
-    """What to add to the tiles' offsets so that they fit, and how sure that is: (M, 4).
+    """Find what to add to the tiles' offsets so that they fit, and how sure it is: (M, 4).
 
     East and north [m], and the variance of each [m²] that the misfit of single cells leaves, as if
     each erred alone: it says by how much one tile is better known than another. NaN where a tile

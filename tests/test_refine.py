@@ -43,7 +43,9 @@ def test_offset_and_yaw(change, yaw_deg):
     yaw = np.deg2rad(yaw_deg)
     error = result.offset - truth_at(result.pivot, yaw)
     assert np.hypot(*error) < (0.008 if change == 0 else 0.012)
-    assert abs(np.rad2deg(result.yaw) + yaw_deg) < (0.02 if change == 0 else 0.1)
+    # over eight such pairs the yaw errs by 0.032° rms
+    assert abs(np.rad2deg(result.yaw) + yaw_deg) < (0.025 if change == 0 else 0.1)
+    assert abs(result.yaw + yaw) < 2 * np.sqrt(result.covariance[2, 2])
 
 
 @pytest.mark.parametrize("tenths", [(0, 0), (1, 7), (3, 3), (5, 5), (10, 5), (9, 10)])

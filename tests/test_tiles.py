@@ -113,7 +113,7 @@ def fitted_slowly(still, moved, place):
         inside = ((near >= 0) & (near < np.array(still.grid.shape)[:, None])).all(axis=0)
         inside[inside] = still.mask[tuple(near[:, inside])]
         if inside.sum() < 0.5 * len(place):
-            return np.full(2, np.nan)
+            return np.full(4, np.nan)
         at = at[:, inside]
         residual = ndimage.map_coordinates(still.layers[1], at, order=3, prefilter=False)
         residual -= value[inside]
@@ -123,13 +123,14 @@ def fitted_slowly(still, moved, place):
         weight = np.clip(1 - (residual / (4 * spread)) ** 2, 0, None) ** 2
         normal = (design * weight[:, None]).T @ design
         if np.linalg.cond(normal) >= 1e4:
-            return np.full(2, np.nan)
+            return np.full(4, np.nan)
+        variance = np.average(residual**2, weights=weight) * np.diag(np.linalg.inv(normal))
         step = -np.linalg.solve(normal, (design * weight[:, None]).T @ residual)
         offset += step
         if np.abs(step).max() < 1e-7:
             break
     close = np.hypot(*offset) <= 3 * still.grid.cell and np.abs(step).max() < 1e-2 * CELL
-    return offset if close else np.full(2, np.nan)
+    return np.append(offset, variance) if close else np.full(4, np.nan)
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
