@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
@@ -13,8 +12,25 @@ from data_synth.change import Change
 from data_synth.seafloor import SITES, Site
 from data_synth.seeing import Seeing
 from data_synth.sfm import Sfm
+from meshreg.checked import parse_toml, read_toml, shown
 from meshreg.errors import UsageError
+from meshreg.settings import Settings
 
+LARGEST = 1e9  # of any number of a recipe
+_RANGES = {
+    "output.size": (1.0, 1000.0),
+    "output.texture": (0.001, 1.0),
+    "output.pages": (1, 64),
+    "output.point_spacing": (0.001, 1.0),
+    "output.tracks": (1, 100),
+    "output.images": (1, 1000),
+    "sfm.mesh_spacing": (0.001, 1.0),
+    "sfm.overlap": (0.0, 1.0),
+    "sfm.holes": (0.0, 1.0),
+    "sfm.scale": (-0.5, 0.5),
+    "sfm.tilt": (-90.0, 90.0),
+    "expect.max_error": (0.0, LARGEST),
+}
 SCENARIOS = Path(__file__).parent / "scenarios"
 
 
@@ -102,10 +118,7 @@ def load(name: str | Path, overrides: Mapping[str, Any] | None = None) -> Recipe
         raise UsageError(
             f"There is no scenario {str(name)!r}.", remedy=f"Choose from {', '.join(scenarios())}."
         )
-    try:
-        document = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise UsageError(f"The recipe cannot be read: {error}.", file=path) from error
+    document = read_toml(path, "The recipe")
     return _build(document, changes, path, str(name) if step else path.stem)
 
 
@@ -122,7 +135,13 @@ def _build(document: dict[str, Any], changes: dict[str, Any], path: Path, name: 
     settings = document.pop("settings", {})
     settings.update({k[9:]: changes.pop(k) for k in list(changes) if k.startswith("settings.")})
     severity = changes.pop("severity", document.pop("severity", 0.0))
-    severity = float(_value(severity))
+    severity = _value(severity)
+    if type(severity) not in (int, float) or not 0 <= severity <= 1:
+        raise UsageError(
+            f"severity is {shown(severity)}; it must be a number from 0 to 1.", file=path
+        )
+    severity = float(severity)
+    Settings().changed(dict(_flat(settings)))
     for key, value in _flat(document):
         recipe = _set(recipe, key, key.split("."), value, path)
     for key, value in _flat(severe):  # what the ladder's top rung says
@@ -137,8 +156,8 @@ def _value(value: Any) -> Any:
     if not isinstance(value, str):
         return value
     try:
-        return tomllib.loads(f"v = {value}")["v"]
-    except tomllib.TOMLDecodeError:
+        return parse_toml(f"v = {value}")["v"]
+    except ValueError:
         return value
 
 
@@ -179,6 +198,13 @@ def _set(record: Any, key: str, parts: list[str], value: Any, path: Path) -> Any
 
 def _fitted(now: Any, value: Any, drawn: bool, key: str, path: Path) -> Any:
     """Return `value` in the type of `now` (a range too where `drawn`), or say what was expected."""
+    low, high = _RANGES.get(key, (-LARGEST, LARGEST))
+    for item in value if isinstance(value, list | tuple) else (value,):
+        if isinstance(item, int | float) and not low <= item <= high:  # NaN too
+            raise UsageError(
+                f"Recipe key {key!r} is {shown(value)}; it must be from {low:g} to {high:g}.",
+                file=path,
+            )
     number = isinstance(value, int | float) and not isinstance(value, bool)
     numbers = isinstance(value, list | tuple) and all(isinstance(v, int | float) for v in value)
     if isinstance(now, bool | str):

@@ -15,6 +15,8 @@ from data_synth.recipe import Recipe
 from data_synth.seafloor import Bounds, Seafloor, make_seafloor
 from data_synth.seeing import Lattice, Plan, Seeing, make_plan, see
 from data_synth.sfm import Distortion, Sfm, identity, make_distortion
+from meshreg.checked import shown
+from meshreg.errors import UsageError
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -224,6 +226,10 @@ def make_scene(recipe: Recipe, seed: int = 0, size: float | None = None) -> Scen
         Side of the patch [m]; the recipe's own by default.
     """
     size = recipe.output.size if size is None else float(size)
+    if not 1 <= size <= 1000:
+        raise UsageError(f"size is {size}; it must be a number from 1 to 1000 m.")
+    if not 0 <= seed < 2**31:
+        raise UsageError(f"seed is {shown(seed)}; it must be a whole number from 0 to {2**31 - 1}.")
     rng = np.random.default_rng([seed, 3])
     place = recipe.place
     centre = np.array([place.east, place.north, place.up])

@@ -359,8 +359,12 @@ def synth(
         str | None,
         typer.Option("--format", help="obj, ply, ply-cloud, laz, glb, colmap or images."),
     ] = None,
-    seed: Annotated[int, typer.Option(help="Another seed is another seafloor.")] = 0,
-    size: Annotated[float | None, typer.Option(help="Side of the patch in metres.")] = None,
+    seed: Annotated[
+        int, typer.Option(min=0, max=2**31 - 1, help="Another seed is another seafloor.")
+    ] = 0,
+    size: Annotated[
+        float | None, typer.Option(help="Side of the patch in metres, 1 to 1000.")
+    ] = None,
     changes: SetOption = None,
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
@@ -382,7 +386,7 @@ def selftest(
     reference: ReferenceArgument,
     moving: Annotated[str, typer.Argument(help="Repeat survey, into which shifts are put.")],
     out: MaybeOutOption = None,
-    count: Annotated[int, typer.Option("--shifts", help="How many shifts.")] = 8,
+    count: Annotated[int, typer.Option("--shifts", min=1, max=1000, help="How many shifts.")] = 8,
     reference_shift: ShiftOption = None,
     moving_shift: ShiftOption = None,
     axes: AxesOption = None,
@@ -449,8 +453,10 @@ def benchmark(
         int | None, typer.Option(metavar="N", help="Pairs of different places; 1000.")
     ] = None,
     size: Annotated[float | None, typer.Option(help="Side of the patches in metres; 12.")] = None,
-    workers: Annotated[int, typer.Option(help="Processes.")] = 2,
-    seed: Annotated[int | None, typer.Option(help="Seed of every pair; 0.")] = None,
+    workers: Annotated[int, typer.Option(min=0, max=1024, help="Processes.")] = 2,
+    seed: Annotated[
+        int | None, typer.Option(min=0, max=2**31 - 1, help="Seed of every pair; 0.")
+    ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on where it stopped.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Start afresh.")] = False,
     as_json: JsonOption = False,
@@ -546,7 +552,7 @@ def validate(
         Path | None, typer.Option(help="The same of the moving survey as delivered.")
     ] = None,
     radius: Annotated[float, typer.Option(help="Pairs within this distance agree; metres.")] = 0.20,
-    seed: Annotated[int, typer.Option(help="Seed of the RANSAC.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Seed of the RANSAC.")] = 0,
     as_json: JsonOption = False,
     debug: DebugOption = False,
 ) -> int:

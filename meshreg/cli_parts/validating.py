@@ -49,8 +49,8 @@ def validate(request: ValidateRequest) -> dict[str, Any]:
     from meshreg.ties.placing import read_placing
     from meshreg.ties.validate import validate as compare
 
-    if not request.radius > 0:
-        raise UsageError(f"--radius is {request.radius}; it must be positive.")
+    if not 0 < request.radius <= 1000:
+        raise UsageError(f"--radius is {request.radius}; it must be over 0 and at most 1000 m.")
     if not request.out.is_dir():
         raise UsageError(
             "is no folder.", file=request.out, remedy="Give the one that `meshreg register` wrote."
