@@ -88,11 +88,29 @@ def new_folder(new: NewFolder, unfinished: Unfinished) -> Iterator[Path]:
     with as_output_error(new.out):
         require_apart(new.out, new.inputs)
         new.out.absolute().parent.mkdir(parents=True, exist_ok=True)
-    with (
-        atomic_folder(new.out, new.overwrite, (new.marker,), new.command) as folder,
-        unfinished.holding(folder),
-    ):
-        yield folder
+    made = None
+    try:
+        with (
+            atomic_folder(new.out, new.overwrite, (new.marker,), new.command) as folder,
+            unfinished.holding(folder),
+        ):
+            made = folder.stat().st_ino
+            yield folder
+    except BaseException as error:
+        with suppress(OSError):
+            if made is not None and new.out.stat().st_ino == made:  # stopped after the last step
+                error.add_note("the result was complete already.")
+        raise
+
+
+@contextmanager
+def in_place() -> Iterator[None]:
+    """Let what stops the block say that some files of a result may be new by then."""
+    try:
+        yield
+    except BaseException as error:
+        error.add_note("some files may be new already, each of them whole.")
+        raise
 
 
 def named_files(

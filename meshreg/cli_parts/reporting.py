@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from rich.markup import escape
 
-from meshreg.cli_parts.common import LOG
+from meshreg.cli_parts.common import LOG, in_place
 from meshreg.cli_parts.console import Voice
 from meshreg.errors import InputError, MeshregError
 
@@ -85,6 +85,12 @@ def remake_report(folder: Path) -> Path:
             file=folder,
             remedy="Run `meshreg register` again.",
         ) from error
+
+
+def remake(folder: Path) -> Path:
+    """Do `meshreg report`: `write_report` in a result that is there already."""
+    with in_place():
+        return write_report(folder)
 
 
 def _result_folder(folder: Path) -> Path:

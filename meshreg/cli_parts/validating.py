@@ -12,7 +12,7 @@ import numpy as np
 from rich.markup import escape
 from rich.table import Table
 
-from meshreg.cli_parts.common import LOG
+from meshreg.cli_parts.common import LOG, in_place
 from meshreg.cli_parts.console import Voice
 from meshreg.errors import InputError, OutputError, UsageError
 
@@ -78,12 +78,9 @@ def validate(request: ValidateRequest) -> dict[str, Any]:
     pictures = {f"figures/{name}.png": picture for name, picture in drawn.items()}
     require_ours(request.out, tuple(pictures))
     pages = (page.encode("utf-8"), to_json(document).encode("utf-8"))
-    try:
+    with in_place():
         write_into(request.out, {**pictures, **dict(zip(PAGES, pages, strict=True))})
-    except BaseException as error:
-        error.add_note("some files of the comparison may be new; the registration is as it was.")
-        raise
-    remake_report(request.out)
+        remake_report(request.out)
     return document
 
 

@@ -75,7 +75,8 @@ def atomic_file(path: Path) -> Iterator[Path]:
             _sync_folder(path.parent)
         finally:
             temporary.unlink(missing_ok=True)
-            os.close(handle)
+            with contextlib.suppress(OSError):  # nothing was written through it
+                os.close(handle)
 
 
 def _new_partial(path: Path) -> tuple[Path, int]:
@@ -245,7 +246,8 @@ def _locked(path: Path, lock: Path) -> Iterator[None]:
         yield
     finally:
         lock.unlink(missing_ok=True)
-        os.close(handle)
+        with contextlib.suppress(OSError):  # it holds nothing that anybody needs
+            os.close(handle)
 
 
 def _clear_leftovers(path: Path, prefix: str) -> None:

@@ -277,7 +277,8 @@ def state_of(there: Path, before: Snapshot, usual: Usual, *, in_place: bool) -> 
     whole = all(kept[name] == before.get(name) or is_new(name) for name in kept)
     if in_place and whole and set(before) <= set(kept):
         return "between", beside
-    return "lost", beside
+    changed = [name for name in usual.left if name not in kept or not is_new(name)]
+    return "lost", " ".join([beside, "not new:", *changed])
 
 
 def faults_of(usual: Usual) -> Iterator[tuple[str, int]]:
@@ -307,7 +308,7 @@ def disturb(bench: Bench, job: Job, usual: Usual, fault: str, k: int) -> tuple[E
         before = bench.lay(job)
         ended = _faulty(bench, command, fault, k, int(usual.size * part**3))
         state, beside = state_of(bench.there, before, usual, in_place=in_place)
-        wrong = _wrong(ended, fault, usual, state, beside)
+        wrong = _wrong(ended, fault, usual, state, beside, in_place=in_place)
         if fault == "SIGKILL" and not wrong:
             wrong = _after_kill(bench, job, command, usual)
         return ended, wrong
@@ -337,7 +338,9 @@ def _no_look_at_the_disk() -> None:
     common._ROOM = -1e18
 
 
-def _wrong(ended: Ended, fault: str, usual: Usual, state: str, beside: str) -> str:
+def _wrong(
+    ended: Ended, fault: str, usual: Usual, state: str, beside: str, *, in_place: bool
+) -> str:
     """What is wrong with an end, or ""."""
     said = ended.said
     if ended.code is None:
@@ -346,7 +349,7 @@ def _wrong(ended: Ended, fault: str, usual: Usual, state: str, beside: str) -> s
         return "traceback"
     if fault == "SIGKILL":
         # between two renames the old result lies beside; `_after_kill` sees it come back
-        return "" if ended.code in (-9, usual.code) and state != "between" else "lived on"
+        return "" if ended.code in (-9, usual.code) else "lived on"
     allowed = {usual.code, 6}
     allowed |= {"SIGINT": {130}, "SIGTERM": {143}, MEMORY: {5}}.get(fault, set())
     if ended.code not in allowed:
@@ -354,12 +357,14 @@ def _wrong(ended: Ended, fault: str, usual: Usual, state: str, beside: str) -> s
     if fault == MEMORY and ended.code == usual.code and "warning: report.html was not made" in said:
         return f"left beside: {beside}" if beside else ""  # a page is no reason to lose a result
     if state == "lost":
-        return "neither the old result nor the new one"
+        return f"neither the old result nor the new one: {beside}"
     if beside:
         return f"left beside: {beside}"
     if ended.code == usual.code and state != "new":
         return f"exit code {ended.code}, but the result is {state}"
-    if ended.code != usual.code and state == "new" and ("intact" in said or "nothing" in said):
+    # in place, what is said to be intact is the one file that is named
+    untrue = "nothing was written" in said or ("intact" in said and not in_place)
+    if ended.code != usual.code and state == "new" and untrue:
         return "the result is new, and is said not to be"
     if ended.code != usual.code and state == "between" and "nothing was written" in said:
         return "some files are new, and nothing is said to be"
@@ -373,7 +378,7 @@ def _after_kill(bench: Bench, job: Job, command: list[str], usual: Usual) -> str
         return f"the next run ends with {ended.code}"
     state, beside = state_of(bench.there, {}, usual, in_place=False)
     if state != "new":
-        return f"the next run's result is {state}"
+        return f"the next run's result is {state}: {beside}"
     return f"the next run leaves beside: {beside}" if beside else ""
 
 
