@@ -10,7 +10,7 @@ import io
 import math
 import threading
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -97,10 +97,7 @@ class EncodedImage:
 def decode_into(file: str, name: str, slot: memoryview) -> tuple[int, ...]:
     """Decode an image file to the front of some memory; return its shape (H, W, 3 or 4)."""
     with _opened(Path(file), None, name) as image:
-        pixels = _pixels(image, name, np.frombuffer(slot, np.uint8))
-        if not np.shares_memory(pixels, np.frombuffer(slot, np.uint8)):
-            np.frombuffer(slot, np.uint8)[: pixels.size] = pixels.ravel()
-        return pixels.shape
+        return _pixels(image, name, np.frombuffer(slot, np.uint8)).shape
 
 
 def open_texture(
@@ -261,12 +258,19 @@ class _RasterioImage:
         bands = "one band" if self._file.count < 3 else f"{self._file.count} bands"
         self.mode = f"{bands} of {self._file.dtypes[0]}"
 
-    def pixels(self) -> UInt8:
+    def pixels(self, room: UInt8 | None) -> UInt8:
         """Decode the first three bands, and the fourth where it is called alpha."""
+        from rasterio.windows import Window
+
         bands = [1, 2, 3] if self._file.count >= 3 else [1, 1, 1]
         if self._file.count > 3 and self._file.colorinterp[3].name == "alpha":
             bands.append(4)
-        return _to_eight_bits(np.moveaxis(self._file.read(bands), 0, -1))
+
+        def rows(top: int, bottom: int) -> Any:
+            window = Window(0, top, self.width, bottom - top)
+            return np.moveaxis(self._file.read(bands, window=window), 0, -1)
+
+        return _eight_bit_rows(rows, _place((self.height, self.width, len(bands)), room))
 
     def __enter__(self) -> _RasterioImage:
         return self
@@ -288,43 +292,71 @@ def _by_rasterio(stream: Any, where: Path | str) -> _RasterioImage:
     )
 
 
-def _to_eight_bits(values: Any) -> UInt8:
-    """Scale integers by their type's range, floats from 0-1 (or 0-255 where any is above 1)."""
-    if values.dtype == np.uint8:
-        return np.ascontiguousarray(values)
-    if np.issubdtype(values.dtype, np.floating):
-        values = np.nan_to_num(values, nan=0.0, posinf=0.0, neginf=0.0)
-        scale = 255.0 if values.size and values.max() <= 1.0 else 1.0
-    else:
-        scale = 255.0 / np.iinfo(values.dtype).max
-    scaled: UInt8 = np.clip(np.rint(values * scale), 0, 255).astype(np.uint8)
-    return scaled
+def _place(shape: tuple[int, int, int], room: UInt8 | None) -> UInt8:
+    """Return an array to fill: the front of `room`, where there is one."""
+    return np.empty(shape, np.uint8) if room is None else room[: math.prod(shape)].reshape(shape)
+
+
+def _strips(height: int) -> Iterator[tuple[int, int]]:
+    """Give the first row and the end of each strip."""
+    for top in range(0, height, _STRIP_ROWS):
+        yield top, min(top + _STRIP_ROWS, height)
+
+
+def _eight_bit_rows(rows: Callable[[int, int], Any], out: UInt8) -> UInt8:
+    """Fill `out` from rows of any type, a strip at a time.
+
+    Integers are scaled by their type's range, floats from 0-1 (or 0-255 where any is above 1).
+    """
+    scale = None
+    for top, bottom in _strips(len(out)):
+        values = rows(top, bottom)
+        if values.dtype == np.uint8:
+            out[top:bottom] = values
+            continue
+        if scale is None and values.dtype.kind == "f":
+            largest = max(float(_finite(rows(*ends)).max(initial=0)) for ends in _strips(len(out)))
+            scale = 255.0 if largest <= 1.0 else 1.0
+        elif scale is None:
+            scale = 255.0 / np.iinfo(values.dtype).max
+        if values.dtype.kind == "f":
+            values = _finite(values)
+        out[top:bottom] = np.clip(np.rint(values * scale), 0, 255)
+    return out
+
+
+def _finite(values: Any) -> Any:
+    return np.nan_to_num(values, nan=0.0, posinf=0.0, neginf=0.0)
 
 
 def _pixels(image: Any, name: str, room: UInt8 | None = None) -> UInt8:
-    """Decode an image into (height, width, 3 or 4) uint8, at the front of `room` if it can be."""
+    """Decode an image into (height, width, 3 or 4) uint8, at the front of `room` if it is given.
+
+    By strips, because Pillow's conversion and its export hold what they convert again.
+    """
     if isinstance(image, _RasterioImage):
-        return image.pixels()
+        return image.pixels(room)
     image.load()
+
+    def strip(top: int, bottom: int) -> Any:
+        return image.crop((0, top, image.width, bottom))
+
     if image.mode[0] in "IF":  # one band of 16 or 32 bits
-        values = np.asarray(image)
-        if image.mode == "I":  # 16 bits held in 32
-            values = np.clip(values, 0, 65535).astype(np.uint16)
-        grey = _to_eight_bits(values)
-        return np.repeat(grey[..., None], 3, axis=2)
+
+        def rows(top: int, bottom: int) -> Any:
+            values = np.asarray(strip(top, bottom))[..., None]
+            # 16 bits may be held in 32.
+            return np.clip(values, 0, 65535).astype(np.uint16) if image.mode == "I" else values
+
+        return _eight_bit_rows(rows, _place((image.height, image.width, 3), room))
     has_alpha = image.mode in ("RGBA", "LA", "PA", "RGBa", "La") or "transparency" in image.info
     mode = "RGBA" if has_alpha else "RGB"
     if image.mode == "LAB":
         raise InputError("has CIELAB pixels.", file=name, remedy="Convert it to RGB.")
-    # By strips, because both Pillow's conversion and its export hold the whole image again.
-    shape = (image.height, image.width, len(mode))
-    out = np.empty(shape, np.uint8) if room is None else room[: math.prod(shape)].reshape(shape)
-    for top in range(0, image.height, _STRIP_ROWS):
-        bottom = min(top + _STRIP_ROWS, image.height)
-        strip = image.crop((0, top, image.width, bottom))
-        if strip.mode != mode:
-            strip = strip.convert(mode)
-        out[top:bottom] = np.asarray(strip)
+    out = _place((image.height, image.width, len(mode)), room)
+    for top, bottom in _strips(image.height):
+        part = strip(top, bottom)
+        out[top:bottom] = np.asarray(part if part.mode == mode else part.convert(mode))
     return out
 
 
