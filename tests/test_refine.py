@@ -12,7 +12,17 @@ import seafloor
 
 from meshreg.heading import as_delivered
 from meshreg.kriging import Ground
-from meshreg.refine import Refined, fit, misfit, over_ground, refine, with_scale
+from meshreg.refine import (
+    Refined,
+    blended,
+    combined,
+    fit,
+    misfit,
+    over_ground,
+    refine,
+    relief_height,
+    with_scale,
+)
 from meshreg.tiles import TileOffsets
 from meshreg.types import Grid, SurveyRaster, Transform
 
@@ -342,3 +352,96 @@ def test_where_ground_goes_is_told_from_the_survey_as_delivered():
     np.testing.assert_allclose(
         places + whole.offset_at(places), turned + floor.offset_at(turned), atol=1e-12
     )
+
+
+def test_a_tile_weighs_by_what_its_fit_says():
+    """Tiles of which a few are well known: they tell the answer, and the stated sigma is true."""
+    rng = np.random.default_rng(5)
+    places, ground = lattice(7, 0.0, 12.0), lattice(15, -0.5, 12.5)
+    ground = Ground(ground, np.full(len(ground), 1 / len(ground)))
+    pivot, error = np.array([6.0, 6.0]), {"alike": [], "told": []}
+    stated = []
+    for _ in range(25):
+        noise = np.where(rng.random(49) < 0.3, 0.01, 0.04)[:, None] ** 2 * np.ones(2)
+        offsets = np.array([0.3, -0.2]) + rng.normal(0, np.sqrt(noise))
+        for name, told in (("alike", None), ("told", noise)):
+            found = TileOffsets(places, offsets, np.arange(49), np.zeros(49, int), 45, told)
+            answer = over_ground(found, ground, pivot)
+            error[name].append(answer.offset - (0.3, -0.2))
+        stated.append(np.trace(answer.covariance[:2, :2]))
+    size = {name: np.mean(np.square(e).sum(axis=1)) for name, e in error.items()}
+    assert size["told"] < 0.45 * size["alike"]
+    assert 0.4 < size["told"] / np.mean(stated) < 1.6
+
+
+def answer_of(offset, sigma, yaw=0.0, turn=1e-3):
+    """An answer of three tiles that agree with it."""
+    places = np.array([[0.0, 0.0], [4.0, 0.0], [0.0, 4.0]])
+    found = TileOffsets(places, np.tile(offset, (3, 1)), np.arange(3), np.zeros(3, int))
+    covariance = np.diag([sigma**2, sigma**2, turn**2])
+
+    def there(at):
+        return np.tile(offset, (len(at), 1))
+
+    pivot = np.zeros(2)
+    return Refined(pivot, np.array(offset), yaw, covariance, found, offset_at=there)
+
+
+def test_channels_that_agree_are_weighed_by_their_covariances():
+    both = combined(answer_of((1.0, 2.0), 0.01), answer_of((1.01, 2.0), 0.02))
+    np.testing.assert_allclose(both.offset, [1.002, 2.0], atol=1e-12)
+    np.testing.assert_allclose(np.diag(both.covariance)[:2], 0.01**2 * 0.8, rtol=1e-12)
+    np.testing.assert_allclose(both.offset_at(np.zeros((1, 2))), [[1.002, 2.0]], atol=1e-12)
+    np.testing.assert_allclose(both.residuals, [[-0.002, 0.0]] * 3, atol=1e-12)
+
+
+@pytest.mark.parametrize("join", [combined, blended])
+def test_what_two_answers_differ_by_is_in_the_covariance(join):
+    """Two answers as sure as each other, half a metre apart: either may be right."""
+    both = join(answer_of((0.0, 0.0), 0.01), answer_of((0.5, 0.0), 0.01))
+    np.testing.assert_allclose(both.offset, [0.25, 0.0], atol=1e-12)
+    assert np.sqrt(both.covariance[0, 0]) == pytest.approx(0.25, rel=0.01)
+    assert np.sqrt(both.covariance[1, 1]) < 0.011
+
+
+@pytest.mark.parametrize("join", [combined, blended])
+def test_nothing_jumps_where_the_other_answer_becomes_the_surer(join):
+    """Sigmas in steps of a thousandth: neither the answer nor the covariance has a step."""
+    sigmas = 0.01 * 1.001 ** np.arange(-400, 401)
+    found = [join(answer_of((0.0, 0.0), 0.01), answer_of((0.06, -0.02), s)) for s in sigmas]
+    offsets = np.array([f.offset for f in found])
+    size = np.array([np.sqrt(np.trace(f.covariance[:2, :2])) for f in found])
+    assert np.abs(np.diff(offsets, axis=0)).max() < 0.002 * 0.06
+    assert np.abs(np.diff(size) / size[1:]).max() < 0.003
+    assert np.hypot(*offsets[0]) > 0.6 * np.hypot(0.06, 0.02) > np.hypot(*offsets[-1])
+
+
+def hillshaded(raster, azimuth, seed):
+    """The raster seen under a sun 45° high: Lambert's cosine, and sand that is grey all over."""
+    rng = np.random.default_rng(seed)
+    height, cell = raster.height.astype(float), raster.grid.cell
+    north, east = np.gradient(height, -cell, cell)
+    sun = np.array([np.sin(azimuth), np.cos(azimuth), 1.0]) / np.sqrt(2)
+    light = (sun[2] - sun[0] * east - sun[1] * north) / np.sqrt(1 + east**2 + north**2)
+    grey = np.clip(130 * np.maximum(light, 0.0) + rng.normal(0, 3, height.shape), 0, 255)
+    color = np.repeat(grey[..., None], 3, axis=2).astype(np.uint8)
+    return dataclasses.replace(raster, color=color, color_valid=raster.valid)
+
+
+@pytest.mark.parametrize("seed", [3, 4])
+def test_light_from_two_sides_is_in_the_error_bar_of_an_image(seed):
+    """Where the image alone tells, light may displace all of it alike; terrain takes that away."""
+    flat = seafloor.Seafloor.random(seed, size=16.0, relief=0.5)
+    still = hillshaded(flat.raster(0.05, 6.0, noise=0.0), np.deg2rad(80), 1)
+    moving = flat.moved(-0.21, 0.13).raster(0.05, 6.0, noise=0.0)
+    moving = hillshaded(moving, np.deg2rad(260), 2)
+    truth, start = np.array([0.21, -0.13]), (0.2, -0.15)
+    image = refine([(still, moving, "image")], start, np.eye(2) * 0.05**2, 0.3)
+    assert image.tiles is not None
+    sigma = np.sqrt(np.trace(image.covariance[:2, :2]) / 2)
+    assert sigma > 0.9 * relief_height(still, moving)
+    assert np.hypot(*(image.offset - truth)) < 3 * sigma
+    used = [(still, moving, "terrain"), (still, moving, "image")]
+    both = refine(used, start, np.eye(2) * 0.05**2, 0.3)
+    assert np.sqrt(np.trace(both.covariance[:2, :2]) / 2) < 0.3 * sigma
+    assert np.hypot(*(both.offset - truth)) < 0.1 * 0.05

@@ -160,3 +160,21 @@ def test_the_kernel_does_what_its_twin_does(seed):
     np.testing.assert_array_equal(np.isnan(found[full]), np.isnan(expected[full]))
     assert np.isfinite(found).any(axis=1).sum() >= 10
     np.testing.assert_allclose(found[full], expected[full], rtol=0, atol=1e-7)
+
+
+def test_flat_ground_beside_it_does_not_change_the_relief():
+    """A sea of no relief, seen by one survey: what is asked of the rock stays as it was."""
+    rock = seafloor.Seafloor.random(3, size=16.0).raster(CELL, 5.0, noise=0.0)
+    rows, cols = rock.grid.shape
+    sea = np.full((rows, 3 * cols), rock.height.min(), np.float32)
+    sea[:, :cols] = rock.height
+    valid = np.ones(sea.shape, bool)
+    grid = dataclasses.replace(rock.grid, shape=sea.shape)
+    color, samples = np.zeros((*sea.shape, 3), np.uint8), np.ones(sea.shape, np.uint16)
+    both = dataclasses.replace(
+        rock, grid=grid, height=sea, valid=valid, color=color, color_valid=valid, samples=samples
+    )
+    inland = np.s_[:, :, : cols - 12]
+    alone, beside = Relief.of(rock).layers[inland], Relief.of(both).layers[inland]
+    np.testing.assert_allclose(beside[[0, 2, 3]], alone[[0, 2, 3]], rtol=0, atol=1e-9)
+    np.testing.assert_array_equal(beside[4][:, 3:], alone[4][:, 3:])
