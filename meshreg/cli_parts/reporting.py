@@ -77,7 +77,8 @@ def remake_report(folder: Path) -> Path:
         As `write_report`, and where record and evidence do not fit together.
     """
     try:
-        return write_report(folder)
+        with in_place():
+            return write_report(folder)
     except (ArithmeticError, LookupError, TypeError, ValueError, AttributeError) as error:
         raise InputError(
             f"cannot be shown: its record and its evidence do not fit ({type(error).__name__}: "
@@ -85,12 +86,6 @@ def remake_report(folder: Path) -> Path:
             file=folder,
             remedy="Run `meshreg register` again.",
         ) from error
-
-
-def remake(folder: Path) -> Path:
-    """Do `meshreg report`: `write_report` in a result that is there already."""
-    with in_place():
-        return write_report(folder)
 
 
 def _result_folder(folder: Path) -> Path:
