@@ -24,7 +24,9 @@ def run(command, main, here):
     what = command[0]
     if what == "crash":
         os.kill(os.getpid(), signal.SIGSEGV)
-    if what == "hang":
+    while what == "hang":
+        pass
+    if what == "wait":
         time.sleep(600)
     if what == "memory":
         bytearray(fuzz.MOST_MEMORY + (1 << 22))
@@ -33,11 +35,12 @@ def run(command, main, here):
     return 1 if what == "bug" else 3
 
 fuzz.run_command, fuzz.MOST_MEMORY = run, 1 << 26
-words = ("crash", "hang", "memory", "trace", "bug", "fine")
+words = ("crash", "hang", "wait", "memory", "trace", "bug", "fine")
 seeds = {"a": fuzz_seeds.Seed({"a.txt": b"1 2 3"}, "a.txt", tuple((word,) for word in words))}
 one = fuzz.Worker(Path(sys.argv[1]) / "w", seeds)
 for k, word in enumerate(words):
-    fuzz.WALL = 1.0 if word == "hang" else 60.0
+    fuzz.WALL = 1.0 if word == "wait" else 600.0
+    fuzz.HANG_CPU = 0.5 if word == "hang" else 60.0
     one.order("a", 7, k, 0)
     while (said := one.answer()) is None:
         time.sleep(0.01)
@@ -67,6 +70,7 @@ def test_it_notices_crashes_hangs_memory_tracebacks_and_bugs(tmp_path):
     assert done.stdout.splitlines() == [
         "crash: CRASH (signal 11)",
         "hang: HANG",
+        "wait: HANG",
         "memory: MEMORY",
         "trace: TRACEBACK",
         "bug: EXIT 1",
