@@ -20,7 +20,7 @@ LEAST_OFF = 100  # points
 OFF = 4.0  # deviations from the surface at which a point is off it
 NEAR = 2.0  # deviations
 REACH = 1.0  # m aside that a copy is looked for, but from 6 to 12 cells
-COPIED = 0.5  # of the points off the surface that one copy must explain,
+COPIED = 2 / 3  # of the points off the surface that one copy must explain,
 LOPSIDED = 2.0  # and so many times what a copy on the other side explains
 
 

@@ -98,7 +98,7 @@ class SiftSettings(Checked):
     inlier_radius: float = number(
         0.20, "matches this near the consensus agree", above=0, high=1000, unit="m"
     )
-    sample: int = number(10, "pairs in a sample of RANSAC", low=2, high=1000)
+    sample: int = number(10, "pairs in a sample of RANSAC", low=1, high=1000)
     inlier_share: float = number(
         0.5, "w of RANSAC: share of inliers that is reckoned with", above=0, below=1
     )

@@ -127,8 +127,8 @@ def test_surfaces_polish_a_registration():
     assert (stated < before + 0.003).all()
     at = registration_sigma(found, *found.registration_error["at"])
     np.testing.assert_allclose(stated, at, rtol=1e-9)
-    with pytest.raises(UsageError, match="'icp'"):
-        register_pair(reference, moving, QUICK.changed({"refine.surfaces": "icp"}))
+    with pytest.raises(UsageError, match="ndt"):
+        register_pair(reference, moving, QUICK.changed({"refine.surfaces": "ndt"}))
 
 
 def test_a_survey_onto_itself_stays():

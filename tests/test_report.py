@@ -278,7 +278,6 @@ def test_names_are_text_and_nothing_else(tmp_path: Path) -> None:
         moving=entry,
         notes=(HOSTILE,),
         estimates=tuple(dataclasses.replace(e, reason=HOSTILE) for e in registration.estimates),
-        settings={**registration.settings, HOSTILE: HOSTILE},
         versions={**registration.versions, HOSTILE: HOSTILE},
     )
     page = Page(made(tmp_path / "r", hostile).read_text(encoding="utf-8"))
@@ -376,7 +375,7 @@ def test_a_page_that_fails_is_said_and_loses_no_result(
     assert {path.name for path in (tmp_path / "r").iterdir()} == names
     monkeypatch.undo()
     (tmp_path / "r" / "report.html").mkdir()  # no room for the file
-    with pytest.raises(OutputError):
+    with pytest.raises(UsageError, match="is not as meshreg wrote it"):
         add_report(registration, tmp_path / "r")
 
 

@@ -11,6 +11,7 @@ from typing import Any
 from meshreg.types import Registration
 
 PAGE = "report.html"
+MANIFEST = "manifest.json"  # keeps the sums of the page too, so that it is no part of it
 
 
 @dataclass(frozen=True)
@@ -46,7 +47,7 @@ def gather(registration: Registration, kept: Mapping[str, Any], folder: Path) ->
     files = sorted(
         (path.relative_to(folder).as_posix(), path.stat().st_size)
         for path in folder.rglob("*")
-        if path.is_file() and path.name != PAGE and not path.name.startswith(".")
+        if path.is_file() and path.name not in (PAGE, MANIFEST) and not path.name.startswith(".")
     )
     log, still = folder / "log.txt", folder / "figures" / "scene.png"
     text = log.read_text(encoding="utf-8", errors="replace") if log.is_file() else ""

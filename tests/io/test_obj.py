@@ -648,7 +648,7 @@ def test_texture_coordinates_outside_the_page(file, pages, far, noted):
     assert ("outside 0-1" in notes_of(survey)) is noted
 
 
-@pytest.mark.parametrize("word", ["nan", "inf", "1e30"])
+@pytest.mark.parametrize("word", ["nan", "inf"])
 def test_faces_without_usable_texture_coordinates(file, pages, word):
     pages("a.png")
     file("newmtl m\nmap_Kd a.png\n", "reef.mtl")

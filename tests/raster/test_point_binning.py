@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from reference_raster import cloud_raster, moved
+from scipy.ndimage import binary_dilation
 
 from meshreg.raster import cloud as module
 from meshreg.raster import rasterize
@@ -43,7 +44,9 @@ def test_the_kernel_agrees_with_its_twin(seed, cell):
     alike = raster.samples == count
     assert (~alike).sum() <= 1
     assert np.abs(raster.samples - count).max() <= 1
-    np.testing.assert_allclose(absolute(raster)[alike], height[alike], atol=1e-4)
+    # and what its cell's height is by then tilts its neighbours', four times over
+    far = ~binary_dilation(~alike, iterations=4)
+    np.testing.assert_allclose(absolute(raster)[far], height[far], atol=1e-4)
     np.testing.assert_array_equal(raster.color_valid, raster.valid)
     assert np.abs(raster.color - color).max() <= 0.501
 

@@ -27,6 +27,7 @@ from meshreg.ties.page import sentence
 from meshreg.ties.placing import Placing
 from meshreg.ties.validate import validate
 from meshreg.types import OffsetEstimate, Transform
+from meshreg.verdict import findings
 
 OFFSET = np.array([1.7, -0.9])
 
@@ -317,7 +318,9 @@ def test_ties_are_one_more_method_marked_as_manual(rasters):
 def test_wrong_ties_move_nothing(rasters, offset):
     wrong = decided(rasters, offset)
     best = wrong.judgement.best
-    assert wrong.judgement.verdict == "accepted"
+    assert wrong.placed.verdict == "accepted"
+    assert wrong.judgement.verdict == "review"  # a person's points say otherwise
+    assert [finding.code for finding in findings(wrong.found)] == ["ties"]
     assert math.hypot(best.east - TRUE[0], best.north - TRUE[1]) < 0.06
     assert "ties" not in best.methods
     if offset[0] > 5:
