@@ -32,6 +32,7 @@ __all__ = [
     "stable_ground",
 ]
 
+STEP_PART = 0.5  # cells: a smaller step is no sign of a tear
 STEP_BLOCKS = 8  # along the overlap's side, whose heights are asked for a step
 STEP_CELLS = 0.02  # of a cell: no height of a block is better than this
 MAX_TILT = np.deg2rad(3.0)
@@ -168,7 +169,10 @@ def _height_step(pair: DemPair, transform: Transform) -> Tear | None:
         return None
     sums = [np.bincount(number, part, len(lattice)) for part in points[:, :2].T]
     places = (np.stack(sums, axis=1) / cells[:, None])[known]
-    return find_tear(places, value[known, None], STEP_CELLS * pair.moving.grid.cell)
+    cell = pair.moving.grid.cell
+    found = find_tear(places, value[known, None], STEP_CELLS * cell)
+    # what lies within a cell may be the ground's slope where it is not quite the same place
+    return None if found is None or found.size <= STEP_PART * cell else found
 
 
 def fitted_plane(pair: DemPair, horizontal: Transform) -> Heights:

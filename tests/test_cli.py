@@ -336,13 +336,13 @@ def test_geometry_alone_where_the_texture_is_broken(
 def test_two_models_of_unknown_scale_need_one(tmp_path: Path, run: Run, verdict: Any) -> None:
     asked = verdict("accepted")
     model = ROOT / "tests" / "data" / "colmap"
-    code, _, error = run("register", model, model, "-o", tmp_path / "out")
+    code, _, error = run("register", model, model, "-o", tmp_path / "out", "--allow-same")
     assert code == 2
     assert "--scale" in error
     assert not asked
     assert list(tmp_path.iterdir()) == []
     code, _, error = run(
-        "register", model, model, "-o", tmp_path / "out", "--scale", 2, "--scale", 3
+        "register", model, model, "-o", tmp_path / "out", "--scale", 2, "--scale", 3, "--allow-same"
     )
     assert code == 0, error
     sizes = [np.ptp(asked[which].bounds[:, 0]) for which in ("reference", "moving")]
@@ -824,7 +824,9 @@ def test_apply_lays_a_model_as_it_was_registered(tmp_path: Path, run: Run, verdi
     verdict("accepted")
     model, out = tmp_path / "model", tmp_path / "out"
     shutil.copytree(ROOT / "tests" / "data" / "colmap", model)
-    code, _, error = run("register", model, model, "-o", out, "--scale", 2, "--scale", 3)
+    code, _, error = run(
+        "register", model, model, "-o", out, "--scale", 2, "--scale", 3, "--allow-same"
+    )
     assert code == 0, error
     code, _, error = run("apply", out, model, "-o", tmp_path / "moved")
     assert code == 0, error

@@ -15,7 +15,7 @@ from made_registration import EAST, NORTH, OFFSET, made_registration
 from PIL import Image
 
 from meshreg.report import draw_figures, evidence, overlays, residuals, scene, style
-from meshreg.report.figures import FIGURES, _save
+from meshreg.report.figures import FIGURES, _picture, _save
 from meshreg.types import Grid, OffsetEstimate, Registration, SurveyRaster
 
 ALL = {*FIGURES, "scores_terrain", "scores_mutual_information"}
@@ -58,7 +58,7 @@ def test_same_record_gives_the_same_picture(tmp_path: Path, accepted: Registrati
     for folder in ("a", "b"):
         (tmp_path / folder).mkdir()
         for name in ("offsets", "matches"):
-            _save(FIGURES[name](accepted), tmp_path / folder / f"{name}.png")
+            _save(_picture(FIGURES[name](accepted)), tmp_path / folder / f"{name}.png")
     for path in (tmp_path / "a").iterdir():
         assert path.read_bytes() == (tmp_path / "b" / path.name).read_bytes(), path.name
 

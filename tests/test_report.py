@@ -25,7 +25,7 @@ from PIL import Image
 
 from meshreg import cli
 from meshreg.cli_parts.reporting import add_report, keep_evidence, write_report
-from meshreg.errors import InputError, OutputError, ResourceLimitError, UsageError
+from meshreg.errors import InputError, ResourceLimitError, UsageError
 from meshreg.io.evidence import NAME, read_evidence, write_evidence
 from meshreg.io.record import read_registration, write_registration
 from meshreg.report import (

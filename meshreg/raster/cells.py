@@ -62,7 +62,9 @@ def choose_cells(
     dem = _default_dem_cell(pair, notes if settings.dem_cell is None else [])
     texels = max(spacing.texels or spacing.points for _, spacing in pair)
     # half a texel would only show how texels are read between their centres
-    ortho = dem if texels > 0.75 * dem else 0.5 * dem
+    # and a cell between the points of a gridded cloud none at all
+    gridded = any(spacing.gridded for _, spacing in pair)
+    ortho = dem if texels > (0.5 if gridded else 0.75) * dem else 0.5 * dem
     if settings.ortho_cell is not None:
         ortho = settings.ortho_cell
         dem = ortho * max(1, math.ceil(dem / ortho - 1e-6))
