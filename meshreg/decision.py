@@ -268,7 +268,7 @@ def _against_ties(
     """Say by how much hand-picked points contradict the answer; '' where they do not."""
     radius = settings.sift.inlier_radius
     for estimate in estimates:
-        if not estimate.manual or estimate.status == "failed":
+        if not estimate.manual:  # one beyond the search window contradicts too
             continue
         used = np.asarray(estimate.evidence.get("inliers", ()), bool)
         there = np.asarray(estimate.evidence.get("picked_reference", np.zeros((0, 2))))[used]
