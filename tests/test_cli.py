@@ -1129,8 +1129,8 @@ def test_surveys_of_different_places_are_rejected(tmp_path: Path, run: Run) -> N
     assert {path.stem for path in (tmp_path / "o" / "figures").iterdir()} == {"extents"}
 
 
-# 0.048 m instead of under 0.03 m since terrain and image are combined, not the surer one chosen
-@pytest.mark.xfail(strict=False, reason="two sparse models' combined answer errs by 0.05 m")
+# 0.048 m instead of under 0.03 m; the cause is not known
+@pytest.mark.xfail(strict=False, reason="two sparse models' answer errs by 0.05 m")
 def test_colmap_models_made_and_registered(tmp_path: Path, run: Run) -> None:
     """As the README says: the models' own frames are arbitrary, their camera positions place them.
 
