@@ -29,8 +29,9 @@ from meshreg.sandwich import block_sandwich
 from meshreg.types import Bool, Float64, Transform, UInt8
 
 MIN_BLOCKS = 12
-# m: algal turf on reefs is mostly lower than 2 cm (Connell, Foster and Airoldi, Marine Ecology
-# Progress Series 495, 2014). Its mean may have grown or gone by anything up to that: the deviation
+# m: algal turf is several millimetres to centimetres tall (Connell, Foster and Airoldi, Marine
+# Ecology Progress Series 495, 2014, doi:10.3354/meps10513); 2 cm is our assumption, not a figure of
+# theirs. Its mean may have grown or gone by anything up to that: the deviation
 # of a rectangular distribution (Guide to the Expression of Uncertainty in Measurement, 4.3.7).
 COVER = 0.02 / np.sqrt(3)
 NODES = 300  # places that stand for the ground, seen or not
