@@ -220,7 +220,6 @@ def _in_frame(
             gain=heights.gain,
             tear=tear,
             step=heights.step,
-            tilt=float(np.rad2deg(np.hypot(*heights.tilt))),
             sigma_up=float(np.sqrt(max(heights.covariance[0, 0], 0.0))),
             relief=heights.relief,
             ties=contradicted,

@@ -26,6 +26,7 @@ from meshreg.heights import STABLE, Heights, stable_ground
 from meshreg.layers import second_surface
 from meshreg.levels import lay_down, rasterize_pair
 from meshreg.offsets import ESTIMATORS, search_radius
+from meshreg.posture import in_degrees, other_axes, posture
 from meshreg.raster.grid import choose_cells
 from meshreg.refine import Refined
 from meshreg.settings import Settings
@@ -95,12 +96,14 @@ def register_pair(  # noqa: PLR0913
     settings = settings or Settings()
     if not allow_same:
         require_different(reference, moving)
+    if unread := "; ".join(filter(None, map(in_degrees, (reference, moving)))):
+        return _unlike(reference, moving, settings, unread, {}, [])
     settings, radius, notes = prepared(reference, moving, settings)
     tell = progress or (lambda stage, fraction: None)
     clock = Clock(tell)
     masks = {"reference": reference_mask, "moving": moving_mask}
     if apart := surveys_apart(reference, moving, radius):
-        return _too_far(reference, moving, settings, apart, clock.seconds, notes)
+        return _unlike(reference, moving, settings, apart, clock.seconds, notes)
     with clock.stage("rasterize"):
         pairs = rasterize_pair(reference, moving, settings, masks, tell)
 
@@ -143,9 +146,12 @@ def register_pair(  # noqa: PLR0913
         second_surface(reference, pairs["dem"][0], settings.seed),
         second_surface(moving, pairs["dem"][1], settings.seed),
     )
-    found = dataclasses.replace(found, layers=layers)
+    dips = (posture(reference).dip, posture(moving).dip)
+    found = dataclasses.replace(found, layers=layers, dips=dips, tilt=_tilt(transform))
     notes += _counted(layers)
-    against = findings(found) if transform is not None else ()
+    if last_word(decision.placed, findings(found)).verdict != "accepted":
+        found = dataclasses.replace(found, axes=other_axes(reference, moving, radius))
+    against = findings(found)
     judgement = last_word(decision.placed, against)
     if judgement.verdict != "accepted":  # how far off it may be is not known
         covariance = error = None
@@ -204,6 +210,15 @@ def _counted(layers: Sequence[Layer | None]) -> list[str]:
         for which, layer in zip(("reference", "moving"), layers, strict=True)
         if layer is not None and layer.cells >= 0.01
     ]
+
+
+def _tilt(transform: Transform | None) -> float:
+    """Return the angle by which a transform tilts the vertical [degrees]."""
+    if transform is None:
+        return 0.0
+    # the sine keeps a small angle that the cosine loses
+    up = transform.rotation[:, 2]
+    return float(np.rad2deg(np.arctan2(np.hypot(up[0], up[1]), up[2])))
 
 
 def _gain(gain: Gain | None) -> dict[str, float] | None:
@@ -277,12 +292,15 @@ def surveys_apart(reference: Survey, moving: Survey, radius: float) -> str:
     away = float(gaps.max())
     if away <= radius:
         return ""
+    said = f"the surveys lie {away:.4g} m apart, beyond the search radius of {radius:g} m"
+    if rival := other_axes(reference, moving, radius):
+        return f"{said}; {rival}"
     # as far as brings the whole of the smaller one on the other, and a tenth
     whole = away + float(np.minimum(np.ptp(a[:, :2], axis=0), np.ptp(b[:, :2], axis=0)).max())
     power = 10.0 ** np.floor(np.log10(1.1 * whole))
     further = 0.5 * power * np.ceil(2.2 * whole / power)
     return (
-        f"the surveys lie {away:.4g} m apart, beyond the search radius of {radius:g} m; check "
+        f"{said}; check "
         "their shifts (--reference-shift, --moving-shift) and CRS, or search further "
         f"(--search-radius {further:g})"
     )
@@ -343,7 +361,7 @@ def _residuals(refined: Refined | None, transform: Transform | None) -> dict[str
     }
 
 
-def _too_far(
+def _unlike(
     reference: Survey,
     moving: Survey,
     settings: Settings,

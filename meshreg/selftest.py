@@ -20,6 +20,7 @@ from meshreg.errors import UsageError
 from meshreg.heading import Pairs, turning
 from meshreg.levels import rasterize_pair
 from meshreg.pipeline import prepared, require_different, surveys_apart
+from meshreg.posture import in_degrees
 from meshreg.settings import Settings
 from meshreg.types import Float64, Survey, Transform, Verdict
 from meshreg.voting import Turn
@@ -200,6 +201,8 @@ def self_test(
         raise UsageError(f"A self-test of {count} shifts tests nothing.", remedy="Use 1 or more.")
     if not allow_same:
         require_different(reference, moving)
+    if unread := "; ".join(filter(None, map(in_degrees, (reference, moving)))):
+        return SelfTest("rejected", unread, 0.0)
     settings, radius, _ = prepared(reference, moving, settings or Settings())
     tell = progress or (lambda stage, fraction: None)
     masks = {"reference": reference_mask, "moving": moving_mask}

@@ -105,19 +105,19 @@ def _upright(found: Found) -> str:
     if found.dips is None or min(found.dips) < WALL:
         return ""
     first, second = found.dips
-    said = f"both surveys stand upright (their surfaces dip by {first:.0f}° and {second:.0f}°)"
-    said += ", and from above a wall cannot be compared"
-    return f"{said}; {found.axes}" if found.axes else said
+    return (
+        f"both surveys stand upright (their surfaces dip by {first:.0f}° and {second:.0f}°), and "
+        "from above a wall cannot be compared"
+    )
 
 
 def _lean(found: Found) -> str:
     if found.dips is not None and max(found.dips) >= WALL > min(found.dips):
         which = "reference" if found.dips[0] > found.dips[1] else "moving"
-        said = (
+        return (
             f"the {which} survey stands upright (its surface dips by {max(found.dips):.0f}°), "
             "the other does not"
         )
-        return f"{said}; {found.axes}" if found.axes else said
     if found.tilt > STEEPEST:
         return f"the answer tilts the moving survey by {found.tilt:.1f}°, beyond {STEEPEST:g}°"
     return ""
@@ -193,6 +193,7 @@ def _uncertain_up(found: Found) -> str:
 Rule = Callable[[Found], str]
 # In the order in which they are told: what explains other findings comes first.
 RULES: tuple[tuple[str, Rule], ...] = (
+    ("axes", lambda found: found.axes),
     ("upright", _upright),
     ("lean", _lean),
     ("layers", _layered),
@@ -206,9 +207,14 @@ RULES: tuple[tuple[str, Rule], ...] = (
 )
 
 
+# What a survey that stands upright, seen from above, brings with it.
+OF_UPRIGHT = frozenset(("layers", "tear", "heights", "scale", "tilt", "yaw", "up"))
+
+
 def findings(found: Found) -> tuple[Finding, ...]:
     """Return what speaks against accepting the pair, each with its code."""
-    told = ((code, rule(found)) for code, rule in RULES)
+    upright = found.dips is not None and max(found.dips) >= WALL
+    told = [(code, rule(found)) for code, rule in RULES if not (upright and code in OF_UPRIGHT)]
     return tuple(Finding(code, said) for code, said in told if said)
 
 

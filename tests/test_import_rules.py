@@ -37,6 +37,7 @@ RULES: dict[str, set[str]] = {
     "heights": BASE | {"dem_pair", "gain", "ground", "ground_plane", "tears"},
     "open3d_loading": set(),
     "surfaces": BASE | {"open3d_loading", "sandwich"},
+    "posture": BASE,
     "apply": BASE,
     "report": BASE,
     "held_out": BASE,
@@ -55,8 +56,8 @@ RULES: dict[str, set[str]] = {
     | {"heading", "heights", "held_out", "judge", "kriging", "offsets", "refine", "statistics"}
     | {"tears", "tiles", "verdict", "voting"},
     "pipeline": BASE
-    | {"decision", "gain", "heading", "heights", "judge", "layers", "levels", "offsets", "raster"}
-    | {"refine", "statistics", "surfaces", "voting", "verdict", "warp", "warp_rasters"},
+    | {"decision", "gain", "heading", "heights", "judge", "layers", "levels", "offsets", "posture"}
+    | {"raster", "refine", "statistics", "surfaces", "voting", "verdict", "warp", "warp_rasters"},
     "ties": BASE | {"io", "raster", "offsets", "statistics", "report"},
     "doctor": set(),
 }

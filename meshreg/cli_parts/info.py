@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from meshreg.io.assemble import texel_size
+from meshreg.posture import level_axes, posture
 from meshreg.types import Float64, Maps, Mesh, PointCloud, Survey
 
 if TYPE_CHECKING:
@@ -115,21 +115,11 @@ def _point_spacing(points: Float64) -> float | None:
 
 
 def plane(survey: Survey) -> tuple[float, str]:
-    """Return the tilt [degrees] of the plane that fits best, and the axis it is thinnest along."""
-    geometry = survey.geometry
-    if isinstance(geometry, Maps):
+    """Return the tilt [degrees] of the plane that fits best, and the axis it is most normal to."""
+    if isinstance(survey.geometry, Maps):
         return 0.0, "z"
-    points = geometry.points[:: max(1, len(geometry.points) // _SAMPLE)]
-    if len(points) < 3:
-        return 0.0, "z"
-    centred = points - np.median(points, axis=0)
-    # Floaters far off must not turn the plane: the outermost tenth is left out.
-    distance = np.linalg.norm(centred, axis=1)
-    centred = centred[distance <= np.percentile(distance, 90)]
-    centred = centred - centred.mean(axis=0)
-    normal = np.linalg.eigh(centred.T @ centred)[1][:, 0]
-    tilt = math.degrees(math.acos(min(1.0, abs(float(normal[2])))))
-    return tilt, "xyz"[int(np.argmax(np.abs(normal)))]
+    lying = posture(survey)
+    return lying.dip, lying.thin
 
 
 def _unit(survey: Survey) -> str:
@@ -143,8 +133,8 @@ def remarks(survey: Survey, tilt: float, thin: str) -> list[str]:
     said = []
     if tilt > LEVEL:
         remark = f"Not level: the plane that fits best is tilted by {tilt:.1f} degrees."
-        if thin == "y":
-            remark += " It looks Y-up: try --up y."
+        if remedy := level_axes(survey):
+            remark += f" It would lie level if it were read with {remedy}: try it."
         else:
             remark += " Level it, or place it by camera positions, before registering."
         said.append(remark)

@@ -114,7 +114,21 @@ _ADVICE: tuple[tuple[str, tuple[str, ...]], ...] = (
         ),
     ),
     (
-        r"stands? upright",
+        r"agree if .* read with",
+        (
+            "Axes are stated by --up and --axes for both files, or for one by NAME.survey.toml "
+            "beside it. `meshreg info FILE` then shows its bounds and whether it lies level.",
+        ),
+    ),
+    (
+        r"look like degrees",
+        (
+            "Longitude and latitude are projected to metres once their CRS is known: write it into "
+            "NAME.survey.toml beside the file, or export in a projected CRS (UTM).",
+        ),
+    ),
+    (
+        r"both surveys stand upright",
         (
             "Seen from above a steep wall shows nothing. Turn both models by the same known "
             "rotation, so that the wall lies level, and register those.",
