@@ -30,6 +30,7 @@ LEVELS = 1.0  # m; farther above each other than this, and than they are high, s
 ELONGATED, MATCHED = 0.5, 0.8  # common part of the two outlines, one laid on the other's middle
 SAMPLE = 20_000  # points
 NEIGHBOURS = 16
+LINE = 1e-4  # of a piece's largest variance: what spreads less across than this has no plane
 DEGREES_WIDE = 0.2  # 22 km along a meridian
 DEGREES_TALL = 20.0  # times as high as wide, as no ground is
 
@@ -67,16 +68,17 @@ def posture(survey: Survey) -> Posture:
 
 
 def _sample(survey: Survey) -> Float64:
-    """(N, 3) float64: some of its points, absolute [m]."""
+    """(N, 3) float64: some of its points, absolute [m]; at random, as every n-th lie in lines."""
     geometry = survey.geometry
     if isinstance(geometry, Maps):
-        known = np.flatnonzero(np.isfinite(geometry.height))
-        some = known[:: max(1, len(known) // SAMPLE)]
+        some = np.flatnonzero(np.isfinite(geometry.height))
+        if len(some) > SAMPLE:
+            some = some[np.random.default_rng(0).integers(len(some), size=SAMPLE)]
         row, col = np.unravel_index(some, geometry.height.shape)
         east, north = geometry.height_grid.east_north(row, col)
         return np.column_stack([east, north, geometry.height.ravel()[some]]).astype(np.float64)
     points = geometry.points
-    if len(points) > SAMPLE:  # at random: rows of a regular file would give lines
+    if len(points) > SAMPLE:
         points = points[np.random.default_rng(0).integers(len(points), size=SAMPLE)]
     return np.asarray(points + survey.origin)
 
@@ -98,7 +100,11 @@ def _of_points(points: Float64) -> Posture:
     local = points - np.median(points, axis=0)
     _, near = cKDTree(local).query(local, NEIGHBOURS)
     pieces = local[near] - local[near].mean(axis=1, keepdims=True)
-    normals = np.linalg.eigh(np.einsum("nki,nkj->nij", pieces, pieces))[1][:, :, 0]
+    spread, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", pieces, pieces))
+    planar = spread[:, 1] > LINE * spread[:, 2]
+    if not planar.any():
+        return Posture(low, high, np.array([0.0, 0.0, 1.0]))
+    normals = axes[planar][:, :, 0]
     frame = np.linalg.eigh(normals.T @ normals)[1]  # last: what most of them point along
     u, v, w = (local @ frame).T
     design = np.column_stack([np.ones(len(u)), u, v])

@@ -66,6 +66,21 @@ def test_a_dem_of_a_wall_dips():
     assert posture(Survey("dem", Maps(wall, grid))).dip == pytest.approx(75.0, abs=0.01)
 
 
+@pytest.mark.parametrize("side", [150, 400, 640])
+@pytest.mark.parametrize("rough", [0.0, 1e-4])
+def test_a_flat_map_of_any_size_is_level(side, rough):
+    """A few of many cells, were they every n-th, would lie in lines that have no plane."""
+    height = np.random.default_rng(1).normal(-5.0, rough, (side, side)).astype(np.float32)
+    grid = Grid(0.0, side * 0.05, 0.05, (side, side))
+    assert posture(Survey("sheet", Maps(height, grid))).dip < 0.5
+
+
+def test_points_on_one_line_have_no_dip():
+    along = np.linspace(0, 30, 500)
+    points = np.column_stack([along, 2 * along, np.zeros(500)])
+    assert posture(read(points)).dip == 0.0
+
+
 def test_a_file_on_its_side_is_told_with_the_axis_that_is_not_in_force():
     first, later = seafloor(seed=1), seafloor(seed=2)
     level = read(first, name="first")
