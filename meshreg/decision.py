@@ -222,6 +222,7 @@ def _in_frame(
             step=heights.step,
             sigma_up=float(np.sqrt(max(heights.covariance[0, 0], 0.0))),
             relief=heights.relief,
+            undecided=refined.undecided,
             ties=contradicted,
         )
         judgement = last_word(placed, findings(found))

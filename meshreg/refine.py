@@ -19,7 +19,15 @@ from meshreg.offsets import neutral
 from meshreg.offsets.channels import smooth
 from meshreg.offsets.surface import MAD_TO_SIGMA
 from meshreg.sandwich import block_sandwich
-from meshreg.tiles import MAX_YAW, Relief, TileOffsets, correlated_tiles, polished_tiles
+from meshreg.tiles import (
+    MAX_YAW,
+    Overlap,
+    Relief,
+    TileOffsets,
+    correlated_tiles,
+    polished_tiles,
+    spread_of_fields,
+)
 from meshreg.types import Bool, Float64, OffsetAt, SurveyRaster
 
 MIN_TILES = 6
@@ -60,6 +68,8 @@ class Refined:
         What the user should know.
     doubt : str
         Why the answer cannot be accepted, if so.
+    undecided : float
+        Where the image alone tells: what its tones and edges disagree by, in cells (one sigma).
     offset_at : callable or None
         Most likely offset (N, 2) [m] at places (N, 2) in the moving survey, internal warp included.
     """
@@ -74,6 +84,7 @@ class Refined:
     note: str = ""
     doubt: str = ""
     scale_variance: float = 0.0
+    undecided: float = 0.0
     offset_at: OffsetAt | None = None
 
 
@@ -118,12 +129,16 @@ def refine(
                 finer = _stated(finer, RESOLUTION * cell)
                 answer = finer if answer is None else blended(finer, answer)
         elif answer is not None:
-            light = relief_height(reference, moving)
-            apart = 2 * np.sqrt(ground.share @ ((ground.places - centre) ** 2).sum(axis=1))
-            answer = _stated(answer, light, light / apart)  # one side displaced, the other not
+            assert answer.tiles is not None
+            light = spread_of_fields(reference, moving, channel, answer.tiles, fields)
+            answer = replace(answer, undecided=float(np.sqrt(np.linalg.eigvalsh(light)[1])) / cell)
+            light = light + relief_height(reference, moving, offset) ** 2 * np.eye(2)
+            apart = 4 * ground.share @ ((ground.places - centre) ** 2).sum(axis=1)
+            turn = 0.5 * np.trace(light) / apart  # one side displaced, the other not
+            answer = _added(answer, _block_diagonal(light, turn))
         answers += [] if answer is None else [answer]
     if answers:
-        best = answers[0] if len(answers) == 1 else combined(*answers)
+        best = answers[0] if len(answers) == 1 else replace(combined(*answers), undecided=0.0)
     else:  # neither channel has enough tiles of its own
         best = replace(rough, covariance=misfit(tiles) * rough.covariance)
         best = _stated(best, PEAK_RESOLUTION * max(moving.grid.cell for _, moving, _ in rasters))
@@ -156,21 +171,37 @@ def _explained(tiles: TileOffsets, rough: Refined) -> Bool:
     return np.asarray(weights > 0)
 
 
-def relief_height(reference: SurveyRaster, moving: SurveyRaster) -> float:
-    """Rms height [m] of both surveys' ground about its surroundings (`RELIEF_CELLS`).
+def relief_height(
+    reference: SurveyRaster, moving: SurveyRaster, offset: tuple[float, float]
+) -> float:
+    """Rms height [m] of the ground about its surroundings (`RELIEF_CELLS`), as both surveys have it.
 
     By so much light can displace what an image shows: a shadow's edge lies a height away from the
     edge that casts it where the light stands at 45°, on its other side if the light does; and all
-    tiles are displaced alike, so that their scatter does not tell. 0 where nothing has a height.
+    tiles are displaced alike, so that their scatter does not tell. The covariance of both surveys'
+    heights has none of their noise in it; two of its sigmas are added. 0 where nothing has a height.
     """
-    squares = []
-    for raster in (reference, moving):
+    overlap = Overlap.at(reference.grid, moving.grid, offset)
+    if overlap.side < 1:
+        return 0.0
+    here = np.s_[slice(*overlap.rows), slice(*overlap.cols)]
+    there = tuple(
+        slice(low + step, high + step)
+        for (low, high), step in zip((overlap.rows, overlap.cols), overlap.shift, strict=True)
+    )
+    heights, known = [], np.ones((1, 1), bool)
+    for raster, part in ((reference, there), (moving, here)):
         mask = raster.valid
-        if mask.any():
-            height = raster.height.astype(np.float64)
-            height = np.where(mask, height - np.median(height[mask]), 0.0)
-            squares.append(np.mean((height - smooth(height, mask, RELIEF_CELLS))[mask] ** 2))
-    return float(np.sqrt(np.mean(squares))) if squares else 0.0
+        height = np.where(mask, raster.height.astype(np.float64), 0.0)
+        height -= np.median(height[mask]) if mask.any() else 0.0
+        heights.append((height - smooth(np.where(mask, height, 0.0), mask, RELIEF_CELLS))[part])
+        known = known & mask[part]
+    if not known.any():
+        return 0.0
+    first, second = (height[known] for height in heights)
+    independent = max(len(first) / RELIEF_CELLS**2, 1.0)
+    doubt = 2.0 * np.sqrt(np.mean(first**2) * np.mean(second**2) / independent)
+    return float(np.sqrt(max(np.mean(first * second), 0.0) + doubt))
 
 
 def combined(first: Refined, second: Refined) -> Refined:
@@ -213,10 +244,10 @@ def _between(
     of_yaw = 1.0 / max(float(apart[2] ** 2 / both[2, 2]), 1.0)
     apart *= np.sqrt(1.0 - np.array([chance, chance, of_yaw]))
     covariance = covariance + weights.prod() * np.outer(apart, apart)
-    if abs(answer[2]) <= 2 * np.sqrt(covariance[2, 2]):  # as `over_ground`
+    surer = first if weights[0] >= weights[1] else second
+    if surer.yaw == 0 and abs(answer[2]) <= 2 * np.sqrt(covariance[2, 2]):  # as `over_ground`
         answer[2] = 0.0
         covariance = _block_diagonal(covariance[:2, :2], covariance[2, 2])
-    surer = first if weights[0] >= weights[1] else second
     assert surer.offset_at is not None
     step = replace(surer, offset=answer[:2] - surer.offset, yaw=float(answer[2]) - surer.yaw)
     whole: OffsetAt = partial(_moved, surer.offset_at, step)
@@ -231,9 +262,13 @@ def _moved(offset_at: OffsetAt, step: Refined, places: Float64) -> Float64:
     return np.asarray(offset_at(places) + _rigid(step, places))
 
 
-def _stated(refined: Refined, resolution: float, turn: float = 0.0) -> Refined:
-    """Add to the covariance what the scatter of tiles does not show, in metres and radians."""
-    floor = np.diag([resolution**2, resolution**2, turn**2])
+def _stated(refined: Refined, resolution: float) -> Refined:
+    """Add to the covariance what sampling alone leaves open [m]."""
+    return _added(refined, np.diag([resolution**2, resolution**2, 0.0]))
+
+
+def _added(refined: Refined, floor: Float64) -> Refined:
+    """Add to the covariance what the scatter of tiles does not show."""
     return replace(refined, covariance=refined.covariance + floor)
 
 

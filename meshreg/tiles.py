@@ -23,6 +23,10 @@ from meshreg.types import Bool, Float64, Grid, OffsetAt, SurveyRaster
 
 MAX_YAW = np.deg2rad(1.0)
 HIGH_PASS = 2.0  # cells: finer than any warp, coarser than the noise of single cells
+STACKED = 64  # tiles whose evidence is added, at most
+# Cells about a tile's own offset: what a field would have instead of it lies within the fields'
+# own width (`neutral.fields`: six cells, to either side); beyond it is chance.
+STACK_REACH, PEAK_REACH = 24, 1.5
 TILE_CELLS = 36  # at most; on small patches at least 7 tiles a side as long as they hold 16 cells
 
 
@@ -141,16 +145,38 @@ def _correlate_tile(
     cell: float,
 ) -> tuple[float, float] | None:
     """Offset (east, north) [m] of one tile from the common shift; None where it has no peak."""
+    cut = _tile_spectra(first, second, tile, overlap.shift, reach, cell)
+    if cut is None:
+        return None
+    surface, _ = neutral.surface(*cut, 0.5)
+    window = cut[2].window
+    peak = find_peak(surface, window.east, window.north, exclusion=3 * cell)
+    if peak is None or peak.border or peak.gap < 0.5:
+        return None
+    return peak.east, peak.north
+
+
+def _tile_spectra(
+    first: neutral.Fields,
+    second: neutral.Fields,
+    tile: tuple[int, int, int],
+    shift: tuple[int, int],
+    reach: int,
+    cell: float,
+) -> tuple[neutral.Spectra, neutral.Spectra, Correlator] | None:
+    """Transforms of a moving tile and of the reference about it; None where half is unknown.
+
+    The window's east and north are from the common shift.
+    """
     top, left, side = tile
-    shift = overlap.shift
     up, west = max(0, top + shift[0] - reach), max(0, left + shift[1] - reach)
     big = (
-        slice(up, top + shift[0] + side + reach),
-        slice(west, left + shift[1] + side + reach),
+        slice(up, max(up, top + shift[0] + side + reach)),
+        slice(west, max(west, left + shift[1] + side + reach)),
     )
     small = (slice(top, top + side), slice(left, left + side))
     a, b = first.mapped(lambda f: f[big]), second.mapped(lambda f: f[small])
-    if b.mask.mean() < 0.5 or a.mask.mean() < 0.5:
+    if not (a.mask.size and b.mask.mean() >= 0.5 and a.mask.mean() >= 0.5):
         return None
     steps = np.arange(-reach, reach + 1)
     window = Window(
@@ -162,13 +188,85 @@ def _correlate_tile(
         (a.mask.shape, b.mask.shape),
     )
     correlator = Correlator(window, single=True, workers=1)
-    surface, _ = neutral.surface(
-        neutral.spectra(a, correlator), neutral.spectra(b, correlator), correlator, 0.5
+    return neutral.spectra(a, correlator), neutral.spectra(b, correlator), correlator
+
+
+def spread_of_fields(
+    reference: SurveyRaster,
+    moving: SurveyRaster,
+    channel: neutral.Channel,
+    tiles: TileOffsets,
+    fields: neutral.FieldsOf = neutral.pair_fields,
+) -> Float64:
+    """Covariance (2, 2) [m²] of what a channel's fields disagree on, alike at all tiles.
+
+    Light from another side moves tones one way and edges another, at all tiles alike, so that
+    their scatter does not tell. Each field's evidence is therefore added over the tiles, each
+    about its own offset, and what the field would have instead of the tiles' common answer goes
+    in by its evidence, unless chance explains the preference. So does a rival of the common
+    answer that lies beside it.
+
+    Parameters
+    ----------
+    reference, moving : SurveyRaster
+    channel : "terrain" or "image"
+    tiles : TileOffsets
+        Of this channel (`correlated_tiles`).
+    fields : callable, optional
+        Instead of `neutral.pair_fields`, where their fields are known already.
+    """
+    first, second = fields(reference, moving, channel)
+    cell, side = moving.grid.cell, tiles.side
+    some = np.linspace(0, len(tiles.places) - 1, min(len(tiles.places), STACKED)).astype(int)
+    row, col = moving.grid.row_col(*tiles.places[some].T)
+    nominal = np.rint(
+        [(reference.grid.north - moving.grid.north), (moving.grid.west - reference.grid.west)]
+        / np.array(cell)
     )
-    peak = find_peak(surface, window.east, window.north, exclusion=3 * cell)
-    if peak is None or peak.border or peak.gap < 0.5:
-        return None
-    return peak.east, peak.north
+    steps = np.rint(tiles.offsets[some, ::-1] * [-1, 1] / cell) + nominal
+
+    def stacked(at: int) -> Float64 | None:
+        corner = round(row[at] - 0.5 * (side - 1)), round(col[at] - 0.5 * (side - 1))
+        shift = int(steps[at, 0]), int(steps[at, 1])
+        cut = _tile_spectra(first, second, (*corner, side), shift, STACK_REACH, cell)
+        return None if cut is None else np.stack(neutral.evidence_of_fields(*cut, 0.5)[0])
+
+    with ThreadPoolExecutor(correlate.WORKERS) as several:
+        found = [part for part in several.map(stacked, range(len(some))) if part is not None]
+    if not found:
+        return np.zeros((2, 2))
+    along = np.arange(-STACK_REACH, STACK_REACH + 1) * cell
+    away = np.hypot(along[None, :], along[:, None])
+    ring = away > 0.6 * STACK_REACH * cell
+    stack = np.sum(found, axis=0)
+    each = [_in_deviations_of(part, ring) for part in stack]
+    total = _in_deviations_of(np.sum(each, axis=0), ring)
+    answer = find_peak(np.where(away <= PEAK_REACH * cell, total, np.nan), along, -along, cell)
+    assert answer is not None
+    home = answer.index
+    spread, weights = np.zeros((2, 2)), 0.0
+    for part in each:
+        peak = find_peak(part, along, -along, 3 * cell)
+        if peak is None or peak.value <= 0:
+            continue
+        plain = 1.0 - np.exp(-0.5 * (peak.value - part[home]) ** 2)
+        apart = np.array([peak.east - answer.east, peak.north - answer.north])
+        spread += peak.value * plain * np.outer(apart, apart)
+        weights += peak.value
+    spread /= max(weights, 1e-12)
+    rival = find_peak(total, along, -along, 3 * cell)
+    if rival is not None:
+        for place in filter(None, [rival.second, rival.whole]):
+            at = round(place[1] / -cell) + STACK_REACH, round(place[0] / cell) + STACK_REACH
+            apart = np.array([place[0] - answer.east, place[1] - answer.north])
+            chance = np.exp(-0.5 * max(total[home] - total[at], 0.0) ** 2)
+            spread += chance / (1 + chance) * np.outer(apart, apart)
+    return np.asarray(spread)
+
+
+def _in_deviations_of(stack: Float64, ring: Bool) -> Float64:
+    """Evidence in deviations of what it is in a ring that no answer of the tiles lies in."""
+    return (stack - np.median(stack[ring])) / max(float(np.std(stack[ring])), 1e-12)
 
 
 def polished_tiles(

@@ -21,6 +21,7 @@ from meshreg.types import Finding, Layer
 STEEPEST = 10.0  # degrees of tilt that may be applied
 WALL = 60.0  # degrees from which a survey cannot be looked at from above
 APART = 0.10  # m between the parts of a model that is torn
+MOST_UNDECIDED = 0.5  # cells: peaks farther apart than this are not one peak that leans
 SECOND_SURFACE = 0.10  # of the cells
 LEAST_UP = 0.14  # m: sigma of up, or the relief, below which neither is absurd
 WHERE_SEEN = 0.5  # of those where a copy could be seen, were it there
@@ -81,6 +82,8 @@ class Found:
         Of up at the centroid of the overlap [m].
     relief : float
         Range of 98 % of the reference's heights [m].
+    undecided : float
+        What tones and edges of the image disagree by, in cells, where it alone tells the place.
     ties : str
         In what hand-picked points contradict the answer.
     """
@@ -98,6 +101,7 @@ class Found:
     layers: tuple[Layer | None, Layer | None] = (None, None)
     sigma_up: float = 0.0
     relief: float = float("inf")
+    undecided: float = 0.0
     ties: str = ""
 
 
@@ -190,6 +194,15 @@ def _uncertain_up(found: Found) -> str:
     )
 
 
+def _undecided(found: Found) -> str:
+    if not found.undecided > MOST_UNDECIDED:
+        return ""
+    return (
+        "the image alone tells the place, and its tones and its edges disagree on it by "
+        f"{found.undecided:.1f} cells: was the light from another side?"
+    )
+
+
 Rule = Callable[[Found], str]
 # In the order in which they are told: what explains other findings comes first.
 RULES: tuple[tuple[str, Rule], ...] = (
@@ -202,13 +215,14 @@ RULES: tuple[tuple[str, Rule], ...] = (
     ("scale", lambda found: found.scaled or _stretched(found)),
     ("tilt", lambda found: found.tilted),
     ("yaw", lambda found: found.turned),
+    ("light", _undecided),
     ("up", _uncertain_up),
     ("ties", lambda found: found.ties),
 )
 
 
 # What a survey that stands upright, seen from above, brings with it.
-OF_UPRIGHT = frozenset(("layers", "tear", "heights", "scale", "tilt", "yaw", "up"))
+OF_UPRIGHT = frozenset(("layers", "tear", "heights", "scale", "tilt", "yaw", "light", "up"))
 
 
 def findings(found: Found) -> tuple[Finding, ...]:

@@ -439,7 +439,7 @@ def test_light_from_two_sides_is_in_the_error_bar_of_an_image(seed):
     image = refine([(still, moving, "image")], start, np.eye(2) * 0.05**2, 0.3)
     assert image.tiles is not None
     sigma = np.sqrt(np.trace(image.covariance[:2, :2]) / 2)
-    assert sigma > 0.9 * relief_height(still, moving)
+    assert sigma > 0.9 * relief_height(still, moving, start)
     assert np.hypot(*(image.offset - truth)) < 3 * sigma
     used = [(still, moving, "terrain"), (still, moving, "image")]
     both = refine(used, start, np.eye(2) * 0.05**2, 0.3)

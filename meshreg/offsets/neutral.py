@@ -162,9 +162,21 @@ def surface(
         NaN where the overlap is too small.
     counts : (K, L) float64
     """
+    each, counts, scored = evidence_of_fields(first, second, correlator, min_overlap)
+    total = np.zeros(counts.shape)
+    for field in each:
+        total += field
+    evidence = in_deviations(total, scored)
+    return np.where(scored, evidence, np.nan), counts
+
+
+def evidence_of_fields(
+    first: Spectra, second: Spectra, correlator: Correlator, min_overlap: float
+) -> tuple[list[Float64], Float64, Bool]:
+    """Evidence (K, L) of each field, 0 where unknown; the overlap's cells; where it is scored."""
     counts = correlator.counts(first.mask, second.mask)
     scored = overlap_floor(counts, min_overlap)
-    total = np.zeros(counts.shape)
+    each = []
     for a, b, power_a, power_b in zip(
         first.parts, second.parts, first.powers, second.powers, strict=True
     ):
@@ -174,9 +186,8 @@ def surface(
         power = np.sqrt(np.maximum(powers[0], 0) * np.maximum(powers[1], 0))
         usable = scored & (power > 1e-6 * np.maximum(power.max(), 1e-300))
         z = np.divide(cross, power, out=np.zeros_like(cross), where=usable) * np.sqrt(counts)
-        total += _in_deviations(z, usable)
-    evidence = _in_deviations(total, scored)
-    return np.where(scored, evidence, np.nan), counts
+        each.append(in_deviations(z, usable))
+    return each, counts, scored
 
 
 def turned_grid(grid: Grid, turn: int) -> Grid:
@@ -194,7 +205,7 @@ def turned_grid(grid: Grid, turn: int) -> Grid:
     )
 
 
-def _in_deviations(values: Float64, use: Any) -> Float64:
+def in_deviations(values: Float64, use: Any) -> Float64:
     """Subtract the median and divide by the robust spread of the cells in use."""
     some = (slice(None, None, 2 if values.size > _MANY else 1),) * 2
     known = values[some][use[some]]
