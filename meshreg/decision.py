@@ -198,6 +198,7 @@ def _in_frame(
             at = judgement.best.east, judgement.best.north
             refined = refine(used, at, judgement.best.sigma, agree, fields)
             contradicted = _against_ties(estimates, refined, motion, settings)
+            estimates = [_beside(estimate, contradicted) for estimate in estimates]
             tear = _torn(used, refined.offset, fields)
             ground = dem_ground(*pairs["dem"], refined.offset)
             fitted, own = with_scale(refined, ground)
@@ -290,6 +291,13 @@ def _against_ties(
                 f"({beyond} of {len(here)} further than {radius:g} m)"
             )
     return ""
+
+
+def _beside(estimate: OffsetEstimate, contradicted: str) -> OffsetEstimate:
+    """Return hand-picked points that contradict the answer as what they are: not "ok"."""
+    if not (estimate.manual and contradicted and estimate.status == "ok"):
+        return estimate
+    return dataclasses.replace(estimate, status="weak", reason=contradicted)
 
 
 def _torn(

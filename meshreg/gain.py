@@ -3,7 +3,7 @@
 Terrain is matched whatever it is multiplied by, so that heights in feet, or exaggerated for a
 picture, would be laid down as well as true ones. The relief that recurs tells the factor: ground
 that is the same has the same heights at every width, while growth, loss and smoothing change some
-widths more than others.
+widths more than others. Relief that recurs upside down is that of a file whose heights are depths.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from meshreg.dem_pair import DemPair
+from meshreg.dem_pair import LEAST_RECURRING, DemPair
 from meshreg.types import Bool, Float64, Transform
 
 WIDTHS = (1.0, 2.0, 4.0, 8.0)  # cells: relief between each and the next is compared
@@ -21,6 +21,10 @@ RECURS = 0.6  # correlation of relief around a cell that recurs
 LEAST_BLOCKS = 4
 MOST_CELLS = 4_000_000  # beyond it every second row and column is left out, and so on
 UNKNOWN = 0.3  # sigma of the logarithm from which a width tells nothing
+# Unlike ground is alike by chance as often as it is alike upside down, so that the one count
+# measures how much of the other is chance.
+BEYOND_CHANCE = 3.0
+INVERTED = 0.25  # of the cells of all widths alike upside down: chance makes a tenth
 
 
 @dataclass(frozen=True)
@@ -35,11 +39,21 @@ class Gain:
     departs : bool
         Whether each width that tells it differs from 1 by more than three sigmas and more than
         a tenth, all to the same side.
+    inverted : bool
+        Whether the relief recurs upside down: what rises in one survey falls in the other.
     """
 
     value: float = 1.0
     sigma: float = float("inf")
     departs: bool = False
+    inverted: bool = False
+
+    @property
+    def unknown(self) -> str:
+        """Why the gain was not determined; '' where it was."""
+        if np.isfinite(self.sigma):
+            return ""
+        return "the relief recurs upside down" if self.inverted else "no relief recurs"
 
 
 def relief_gain(pair: DemPair, transform: Transform, most: float = 0.1) -> Gain:
@@ -58,7 +72,11 @@ def relief_gain(pair: DemPair, transform: Transform, most: float = 0.1) -> Gain:
     most : float
         A gain nearer to 1 than this does not depart from it.
     """
-    found = [told for told in _at_widths(pair, transform) if told[1] < UNKNOWN]
+    widths = list(_at_widths(pair, transform))
+    upright, inverted = np.mean([(w.upright, w.inverted) for w in widths or [_Width(None)]], axis=0)
+    if inverted >= max(INVERTED, BEYOND_CHANCE * upright):
+        return Gain(inverted=True)
+    found = [width.told for width in widths if width.told is not None and width.told[1] < UNKNOWN]
     if not found:
         return Gain()
     value, sigma = min(found, key=lambda told: told[1])
@@ -68,8 +86,15 @@ def relief_gain(pair: DemPair, transform: Transform, most: float = 0.1) -> Gain:
     return Gain(float(np.exp(value)), float(sigma), departs)
 
 
-def _at_widths(pair: DemPair, transform: Transform) -> Iterator[tuple[float, float]]:
-    """Logarithm of the gain and its sigma at each width where relief recurs."""
+@dataclass(frozen=True)
+class _Width:
+    told: tuple[float, float] | None  # logarithm of the gain and its sigma, where relief recurs
+    upright: float = 0.0  # share of the cells that are alike
+    inverted: float = 0.0  # that are alike upside down
+
+
+def _at_widths(pair: DemPair, transform: Transform) -> Iterator[_Width]:
+    """Compare the relief of each width with that of the other survey."""
     if not pair.row.size:
         return
     difference, points = pair.differences(transform)
@@ -86,9 +111,7 @@ def _at_widths(pair: DemPair, transform: Transform) -> Iterator[tuple[float, flo
         smoothed = _smoothed(maps, known, width)
         if coarser is not None:
             first, second = smoothed - coarser
-            told = _of_relief(first, second, known, 2 * width)
-            if told is not None:
-                yield told
+            yield _of_relief(first, second, known, 2 * width)
         coarser = smoothed
 
 
@@ -101,10 +124,8 @@ def _smoothed(maps: Float64, known: Bool, width: float) -> Float64:
     )
 
 
-def _of_relief(
-    first: Float64, second: Float64, known: Bool, width: float
-) -> tuple[float, float] | None:
-    """Logarithm of the ratio of second to first where they are alike, and its sigma."""
+def _of_relief(first: Float64, second: Float64, known: Bool, width: float) -> _Width:
+    """Ratio of second to first where they are alike."""
     from scipy.ndimage import uniform_filter
 
     def around(products: Float64) -> Float64:
@@ -116,17 +137,20 @@ def _of_relief(
         around(first * second), np.sqrt(size), out=np.zeros_like(first), where=size > 0
     )
     row, col = np.nonzero(known & (alike >= RECURS))
-    if not row.size:
-        return None
+    upside_down = int(np.count_nonzero(known & (alike <= -RECURS)))
+    count = max(int(np.count_nonzero(known)), 1)
+    shares = row.size / count, upside_down / count
+    if row.size <= max(BEYOND_CHANCE * upside_down, LEAST_RECURRING * count):
+        return _Width(None, *shares)
     side = max(8, int(4 * width))
     _, number = np.unique((row // side) * known.shape[1] + col // side, return_inverse=True)
     a, b = first[row, col], second[row, col]
     power, other, both = (np.bincount(number, p) for p in (a * a, b * b, a * b))
     if len(power) < LEAST_BLOCKS or min(power.sum(), other.sum()) <= 0:
-        return None
+        return _Width(None, *shares)
     value = 0.5 * float(np.log(other.sum() / power.sum()))
     alike_all = float(np.clip(both.sum() / np.sqrt(power.sum() * other.sum()), 1e-3, 1.0))
     between = -np.log(alike_all) / np.sqrt(3)
     apart = 0.5 * (other / other.sum() - power / power.sum())
     scatter = float((apart**2).sum()) * len(power) / (len(power) - 1)
-    return value, float(np.hypot(between, np.sqrt(scatter)))
+    return _Width((value, float(np.hypot(between, np.sqrt(scatter)))), *shares)

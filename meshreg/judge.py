@@ -25,13 +25,14 @@ from meshreg.types import Float64, OffsetEstimate, SurveyRaster, Verdict
 EXCHANGES = ((True, False), (False, True), (True, True))  # down, across
 TURNS = tuple((turn, flip) for turn in range(4) for flip in (False, True))[1:]
 SCORED_OVERLAP = 0.10  # of the largest: the neutral measure is fair to small overlaps
+EXCHANGED = "with east and north exchanged"
 TURN_NAMES = {
     (0, True): "mirrored east-west",
     (2, True): "mirrored north-south",
     (1, False): "turned by 90°",
     (2, False): "turned by 180°",
     (3, False): "turned by 270°",
-    (1, True): "with east and north exchanged",
+    (1, True): EXCHANGED,
     (3, True): "with east and north exchanged and reversed",
 }
 
@@ -392,10 +393,11 @@ def _verdict(
         and channel.peak is not None
         and channel.false_alarm(channel.peak.gap) < settings.max_false_alarm
     }
-    turned = _turned(maps, settings)
+    turned = turned_map(maps, settings)
+    how = turned if turned.startswith("with") else f"when {turned}"
     words = ", ".join(f"{name} gap {gap:.1f}" for name, gap in best.gaps.items())
     if turned and max(best.gaps.values()) < settings.accept_gap:
-        return say("rejected", f"the moving survey fits only when {turned}: check its axes")
+        return say("rejected", f"the moving survey fits only {how}: check its axes")
     if contradicting:
         where = " and ".join(contradicting)
         return say(
@@ -420,7 +422,7 @@ def _verdict(
             "review", "the best offset is at the search border; try a larger --search-radius"
         )
     if turned:
-        return say("review", f"the moving survey fits just as well when {turned}")
+        return say("review", f"the moving survey fits just as well {how}")
     if alarm > settings.max_false_alarm:
         return say("review", f"chance could do as well once in {1 / alarm:.3g} ({words})")
     if len(support) >= 2 and max(support.values()) >= settings.accept_gap / 2:
@@ -453,8 +455,8 @@ def _false_alarm(
     return alarm
 
 
-def _turned(maps: Mapping[str, ChannelMap], settings: JudgeSettings) -> str:
-    """Name of a mirrored or turned map that fits far better than chance, or ''."""
+def turned_map(maps: Mapping[str, ChannelMap], settings: JudgeSettings) -> str:
+    """Return the name of a mirrored or turned map that fits far better than chance, or ''."""
     worst, name = 0.0, ""
     for channel in maps.values():
         for turn, gap in channel.turned.items():

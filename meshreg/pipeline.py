@@ -18,7 +18,7 @@ import numpy as np
 
 from meshreg import judge as judging
 from meshreg import statistics
-from meshreg.decision import Clock, Manual, Progress, completed, decide
+from meshreg.decision import Clock, Decision, Manual, Progress, completed, decide
 from meshreg.errors import InputError, UsageError
 from meshreg.gain import Gain
 from meshreg.heading import Pairs, turning
@@ -26,7 +26,7 @@ from meshreg.heights import STABLE, Heights, stable_ground
 from meshreg.layers import second_surface
 from meshreg.levels import lay_down, rasterize_pair
 from meshreg.offsets import ESTIMATORS, search_radius
-from meshreg.posture import in_degrees, other_axes, posture
+from meshreg.posture import axes_after, in_degrees, other_axes, posture
 from meshreg.raster.grid import choose_cells
 from meshreg.refine import Refined
 from meshreg.settings import Settings
@@ -150,7 +150,8 @@ def register_pair(  # noqa: PLR0913
     found = dataclasses.replace(found, layers=layers, dips=dips, tilt=_tilt(transform))
     notes += _counted(layers)
     if last_word(decision.placed, findings(found)).verdict != "accepted":
-        found = dataclasses.replace(found, axes=other_axes(reference, moving, radius))
+        axes = _axes(reference, moving, decision, settings, radius)
+        found = dataclasses.replace(found, axes=axes)
     against = findings(found)
     judgement = last_word(decision.placed, against)
     if judgement.verdict != "accepted":  # how far off it may be is not known
@@ -221,10 +222,36 @@ def _tilt(transform: Transform | None) -> float:
     return float(np.rad2deg(np.arctan2(np.hypot(up[0], up[1]), up[2])))
 
 
-def _gain(gain: Gain | None) -> dict[str, float] | None:
-    """Return the gain of the heights for the record; None where no relief recurs."""
-    if gain is None or not np.isfinite(gain.sigma):
+def _axes(
+    reference: Survey, moving: Survey, decision: Decision, settings: Settings, radius: float
+) -> str:
+    """Name the axes with which image, relief, or bounds and slopes would agree; '' for none.
+
+    Bounds come last: they alone cannot tell depths from north, east and down.
+    """
+    gain, maps, limit = (
+        decision.found.gain,
+        decision.judgement.maps,
+        settings.judge.accept_gap,
+    )
+    said = ""
+    if gain is not None and gain.inverted:
+        said = axes_after(reference, moving, np.diag([1.0, 1.0, -1.0]), "the relief")
+    elif judging.turned_map(maps, settings.judge) == judging.EXCHANGED:
+        exchange = np.eye(3)[[1, 0, 2]]
+        agree = [n for n, part in maps.items() if part.turned.get(judging.EXCHANGED, 0.0) >= limit]
+        if "terrain" not in agree:  # its heights are negated too, as north, east and down are
+            exchange[2, 2] = -1.0
+        said = axes_after(reference, moving, exchange, f"the {agree[0]}")
+    return said or other_axes(reference, moving, radius)
+
+
+def _gain(gain: Gain | None) -> dict[str, Any] | None:
+    """Return the gain of the heights for the record; None where it was not looked for."""
+    if gain is None:
         return None
+    if gain.unknown:
+        return {"value": None, "sigma": None, "reason": gain.unknown}
     return {"value": gain.value, "sigma": gain.sigma}
 
 

@@ -185,7 +185,37 @@ def other_axes(reference: Survey, moving: Survey, radius: float) -> str:
     return _said(which, name, surveys)
 
 
-def _said(which: str, name: str, surveys: tuple[Survey, Survey]) -> str:
+def axes_after(reference: Survey, moving: Survey, change: Float64, what: str) -> str:
+    """Name the axes that a file has if its east, north, up are to be changed as the data ask.
+
+    Parameters
+    ----------
+    reference, moving : Survey
+    change : (3, 3) float64
+        What the east, north and up of one of them are to be multiplied by for both to agree: an
+        exchange of axes, its own inverse.
+    what : str
+        What showed it: "the image", "the relief".
+
+    Returns
+    -------
+    str
+        '' where the file cannot be read in that way.
+    """
+    surveys = (reference, moving)
+    lying = [survey.bounds[:, 2] for survey in surveys]
+    above = [low + high > 2 * (high - low) for low, high in lying]
+    # a seafloor lies below the sea's level: where heights are negated, one that does not is wrong
+    which = "reference" if change[2, 2] < 0 and above[0] and not above[1] else "moving"
+    frame = _frame(reference if which == "reference" else moving)
+    now = "" if frame is None else _name(frame.axes)
+    name = _name(change @ AXES[now]) if now else ""
+    return _said(which, name, surveys, what) if name else ""
+
+
+def _said(
+    which: str, name: str, surveys: tuple[Survey, Survey], what: str = "bounds and slopes"
+) -> str:
     key, value = name.replace('"', "").split(" = ")
     matrix = value.startswith("[")
     option = f"--{key} {value}"
@@ -197,7 +227,7 @@ def _said(which: str, name: str, surveys: tuple[Survey, Survey]) -> str:
     # the option holds for both files: it may be given where it leaves the other as it is
     alone = matrix or frame is None or _name(frame.axes) != name
     how = option if not alone else f"{name} in {survey.name}.survey.toml beside it"
-    return f"bounds and slopes would agree if the {which} survey were read with {how}: try it"
+    return f"{what} would agree if the {which} survey were read with {how}: try it"
 
 
 def _frame(survey: Survey) -> Frame | None:

@@ -716,7 +716,8 @@ class Registration:
         reason; empty where nothing was.
     heights_gain : mapping or None
         How many times as high the moving survey's relief is as the reference's: `value`, and
-        `sigma` of its natural logarithm (`meshreg.gain`); None where no relief recurs.
+        `sigma` of its natural logarithm (`meshreg.gain`), both None with the `reason` where that
+        could not be told; None where it was not looked for.
     warp : Warp or None
         The bend that was applied after the transform, where one was asked for and found.
     evidence : mapping
@@ -745,7 +746,7 @@ class Registration:
     warp: Warp | None = None
     false_alarm: float | None = None
     findings: tuple[Finding, ...] = ()
-    heights_gain: Mapping[str, float] | None = None
+    heights_gain: Mapping[str, Any] | None = None
 
     def __post_init__(self) -> None:
         if self.covariance is not None:

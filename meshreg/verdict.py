@@ -129,6 +129,11 @@ def _lean(found: Found) -> str:
 
 def _heights(found: Found) -> str:
     gain = found.gain
+    if gain is not None and gain.inverted:
+        return (
+            "the relief recurs upside down, as where one survey's heights are depths: what rises "
+            "in one falls in the other"
+        )
     if gain is None or not gain.departs:
         return ""
     value = gain.value

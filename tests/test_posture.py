@@ -191,3 +191,29 @@ def test_two_walls_are_reviewed_as_such():
     assert "leans" not in found.reason
     assert "tilted against" not in found.reason
     assert "both surveys would lie level and agree if they were read with --up y" in found.reason
+
+
+@pytest.mark.parametrize(
+    ("axes", "name", "rises"),
+    [
+        (np.diag([1.0, 1.0, -1.0]), "axes = [[1, 0, 0], [0, 1, 0], [0, 0, -1]]", 12.0),
+        (np.diag([1.0, 1.0, -1.0]), "axes = [[1, 0, 0], [0, 1, 0], [0, 0, -1]]", 0.0),
+        (NED, 'axes = "ned"', 0.0),
+        (np.eye(3)[[1, 0, 2]], "axes = [[0, 1, 0], [1, 0, 0], [0, 0, 1]]", 12.0),
+    ],
+)
+def test_axes_that_bounds_cannot_tell_are_told_by_image_and_relief(axes, name, rises):
+    """On a square plot around zero: what the image knows again may have its heights upside down."""
+    first, later = floors()
+    below = np.array([0.0, 0.0, -rises])
+    reference = dataclasses.replace(ground(first, half=3.5, step=0.05, seed=1), origin=below)
+    moving = displaced(ground(later, half=3.5, step=0.05, seed=2))[0]
+    moving = dataclasses.replace(moving, origin=moving.origin + below)
+    wrong = turned(moving, axes)
+    wrong = dataclasses.replace(
+        wrong, source=(SourceFile(Path("later.ply"), "ply", Frame(np.eye(3))),)
+    )
+    found = register_pair(reference, wrong, QUICK)
+    assert found.verdict != "accepted"
+    said = next(finding.said for finding in found.findings if finding.code == "axes")
+    assert f"would agree if the moving survey were read with {name} in" in said

@@ -67,6 +67,40 @@ def test_a_gain_is_recovered_with_its_error(times):
         assert abs(np.log(gain.value / times)) < 3 * gain.sigma < 0.3
 
 
+@pytest.mark.parametrize("half", [2.5, 5.0])
+def test_what_does_not_recur_has_no_gain(half):
+    """Noise is alike by chance as often as it is alike upside down."""
+    motion = Transform()
+    for seed in range(4):
+        pair = seafloor.rasters(seed, offset=(0.0, 0.0), half=half)["dem"]
+        rng = np.random.default_rng(seed)
+        noise = [
+            dataclasses.replace(
+                one, height=rng.normal(0, size, one.height.shape).astype(np.float32)
+            )
+            for one, size in zip(pair, (0.01, 0.05), strict=True)
+        ]
+        gain = relief_gain(DemPair.of(*noise, motion, None), motion)
+        assert (gain.unknown, gain.departs, gain.inverted) == ("no relief recurs", False, False)
+
+
+@pytest.mark.parametrize("change", [0.0, 0.5])
+def test_relief_upside_down_is_known(change):
+    motion = Transform()
+    for seed in range(3):
+        for half in (2.5, 6.0):
+            still, moving = seafloor.rasters(
+                seed, offset=(0.0, 0.0), up=0.0, change=change, half=half
+            )["dem"]
+            upright = relief_gain(DemPair.of(still, moving, motion, None), motion)
+            moving = dataclasses.replace(moving, height=-moving.height)
+            gain = relief_gain(DemPair.of(still, moving, motion, None), motion)
+            assert gain.inverted
+            assert gain.unknown == "the relief recurs upside down"
+            assert not upright.inverted
+            assert not upright.unknown
+
+
 def bent(places, rng, size=0.1):
     """A smooth bend of some `size` m rms, as wide as the patch."""
     x, y = places.T / 12.0
@@ -184,6 +218,7 @@ PLACED = Judgement("accepted", "terrain and image agree", None)
         (Found(stretch=Stretch(1.0199, 0.001, 5.7, 7.0)), "scale"),
         (Found(stretch=Stretch(0.99, 0.001, 2.8, 2.0)), "scale"),
         (Found(gain=Gain(3.28, 0.02, True)), "heights"),
+        (Found(gain=Gain(inverted=True)), "heights"),
         (Found(tilt=12.0), "lean"),
         (Found(dips=(80.0, 81.0)), "upright"),
         (Found(dips=(4.0, 81.0)), "lean"),

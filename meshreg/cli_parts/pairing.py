@@ -12,6 +12,7 @@ from meshreg.cli_parts.common import SurveyRequest
 from meshreg.cli_parts.info import plane, remarks
 from meshreg.errors import ResourceLimitError, UsageError
 from meshreg.io.framing import UNITS
+from meshreg.posture import in_degrees
 from meshreg.settings import Settings
 from meshreg.types import Float64, Maps, Registration, Survey
 
@@ -146,6 +147,8 @@ def level_notes(surveys: tuple[Survey, Survey]) -> list[str]:
     """Say which of the surveys stand upright, as `meshreg info` does; a slope is left alone."""
     notes = []
     for survey in surveys:
+        if in_degrees(survey):  # in which no slope has a meaning
+            continue
         tilt, thin = plane(survey)
         if thin != "z":
             notes.append(f"{survey.name}: {remarks(survey, tilt, thin)[0]}")
@@ -154,6 +157,8 @@ def level_notes(surveys: tuple[Survey, Survey]) -> list[str]:
 
 def unit_notes(surveys: tuple[Survey, Survey]) -> list[str]:
     """Say where one survey is as many times as wide as the other as two units' lengths differ."""
+    if any(in_degrees(survey) for survey in surveys):
+        return []
     widths = [float(np.hypot(*np.ptp(survey.bounds[:, :2], axis=0))) for survey in surveys]
     if not all(width > 0 for width in widths):
         return []

@@ -31,7 +31,7 @@ _ADVICE: tuple[tuple[str, tuple[str, ...]], ...] = (
         ),
     ),
     (
-        r"when (turned|mirrored|with east)",
+        r"when (turned|mirrored)|with east and north",
         (
             "One of the files has its axes exchanged or mirrored. Check --axes (enu or ned) and "
             "--up (y or z), or write them into a NAME.survey.toml beside the file that differs.",
@@ -87,6 +87,13 @@ _ADVICE: tuple[tuple[str, tuple[str, ...]], ...] = (
         (
             "The lengths of the surveys differ. Check the scale bars or camera positions of the "
             "model that is wrong, and make it again; growth does not stretch the ground.",
+        ),
+    ),
+    (
+        r"recurs upside down",
+        (
+            "Export the survey whose heights are depths with up counted upwards, or state its axes "
+            "in a NAME.survey.toml beside it.",
         ),
     ),
     (
