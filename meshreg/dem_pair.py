@@ -78,15 +78,15 @@ class DemPair:
         height = map_coordinates(self.spline, at, order=3, prefilter=False, mode="mirror")
         return height + self.base - points[:, 2], points
 
-    def where_detail_recurs(self, transform: Transform) -> DemPair:
-        """Return the pair that counts only recurring ground; none of it, where there is little."""
+    def where_detail_recurs(self, transform: Transform, least: float = LEAST_RECURRING) -> DemPair:
+        """Return the pair that counts only recurring ground; none where that is under `least`."""
         difference, points = self.differences(transform)
         known = np.zeros(self.moving.grid.shape, bool)
         known[self.row, self.col] = True
         heights = np.zeros((2, *known.shape))
         heights[:, self.row, self.col] = points[:, 2] + difference, points[:, 2]
         counts = recurring(heights[0], heights[1], known)[self.row, self.col]
-        return replace(self, counts=counts & (counts.mean() >= LEAST_RECURRING))
+        return replace(self, counts=counts & (counts.mean() >= least))
 
 
 def points_of(raster: SurveyRaster, row: Index, col: Index) -> Float64:

@@ -34,6 +34,7 @@ __all__ = [
 
 STEP_PART = 0.5  # cells: a smaller step is no sign of a tear
 STEP_BLOCKS = 8  # along the overlap's side, whose heights are asked for a step
+STEP_SHARE = 0.1  # of a block that must recur for its height to be asked
 STEP_CELLS = 0.02  # of a cell: no height of a block is better than this
 MAX_TILT = np.deg2rad(3.0)
 # m, sigma: how far sand may have risen or fallen where nothing tells; by then up is no better known
@@ -155,7 +156,9 @@ def fit_heights(
 
 def _height_step(pair: DemPair, transform: Transform) -> Tear | None:
     """Find two populations of height among blocks of recurring ground."""
-    recurs = pair.where_detail_recurs(transform)
+    recurs = pair.where_detail_recurs(
+        transform, 0.0
+    )  # each block is asked whether enough of it does
     row, col = pair.row[recurs.counts], pair.col[recurs.counts]
     if not row.size:
         return None
@@ -164,7 +167,7 @@ def _height_step(pair: DemPair, transform: Transform) -> Tear | None:
     side = max(int(np.sqrt(np.ptp(row) * np.ptp(col))) // STEP_BLOCKS, 8)
     lattice, number = numbered(row // side, col // side)
     value, cells, _, _ = block_grounds(difference, number, len(lattice))
-    known = cells >= 0.25 * side**2
+    known = cells >= STEP_SHARE * side**2
     if not known.any():
         return None
     sums = [np.bincount(number, part, len(lattice)) for part in points[:, :2].T]

@@ -21,6 +21,7 @@ LEAST_TILES = 16
 LEAST_SHARE = 0.12  # of the tiles: a smaller piece is ground that has changed
 FALL = 0.5  # a jump must bring the squared error below this share of a smooth bend's
 SURE = 5.0  # sigmas
+TRIED = 8  # regions of those that explain most by least squares, that are fitted robustly
 _SIDES = ("east", "north-east", "north", "north-west", "west", "south-west", "south", "south-east")
 
 
@@ -85,11 +86,12 @@ def find_tear(places: Float64, values: Float64, resolution: float) -> Tear | Non
     if not len(regions):
         return None
     base = _polynomials(arm, plain)
-    best = regions[int(np.argmin(_errors_with(base, regions, values, start)))]
-    if 2 * best.sum() > count:
-        best = ~best
+    likely = regions[np.argsort(_errors_with(base, regions, values, start), kind="stable")[:TRIED]]
+    fits = [_fit(np.column_stack([base, part]), values, start, resolution) for part in likely]
+    scale = min(fit.scale for fit in fits)
+    chosen = int(np.argmin([fit.loss(scale) for fit in fits]))
+    torn, best = fits[chosen], likely[chosen]
     design = np.column_stack([base, best])
-    torn = _fit(design, values, start, resolution)
     # a robust bend would set aside what lies along the tear: both are asked for the same tiles
     kept = torn.weights > 0
     bent = values[kept] - smooth[kept] @ np.linalg.lstsq(smooth[kept], values[kept], rcond=None)[0]
@@ -97,7 +99,8 @@ def find_tear(places: Float64, values: Float64, resolution: float) -> Tear | Non
     error = np.array([(torn.size[kept] ** 2).sum(), (bent**2).sum()]) / np.maximum(freedom, 1)
     if error[0] > FALL * error[1]:
         return None
-    apart = torn.answer[-1]
+    # counted for the smaller part, whichever of the two was fitted
+    apart = torn.answer[-1] if 2 * best.sum() <= count else -torn.answer[-1]
     covariance = np.linalg.pinv((design * torn.weights[:, None]).T @ design)
     sigma = torn.scale * float(np.sqrt(covariance[-1, -1]))
     sure = np.linalg.norm(apart) > SURE * sigma * np.sqrt(axes)
@@ -105,6 +108,7 @@ def find_tear(places: Float64, values: Float64, resolution: float) -> Tear | Non
     held = min(torn.weights[best].sum(), torn.weights[~best].sum())
     if not sure or held < 0.5 * LEAST_SHARE * count:
         return None
+    best = best if 2 * best.sum() <= count else ~best
     away = arm[best].mean(axis=0) - arm[~best].mean(axis=0)
     side = _SIDES[round(float(np.arctan2(away[1], away[0])) / (np.pi / 4)) % 8]
     return Tear(np.asarray(apart), sigma, float(best.mean()), side)
@@ -116,6 +120,11 @@ class _Fit:
     weights: Float64  # (M,)
     size: Float64  # (M,) lengths of the residuals [m]
     scale: float  # robust deviation along one axis [m]
+
+    def loss(self, scale: float) -> float:
+        """Tukey's biweight loss of the residuals at four deviations of `scale` [m]."""
+        inner = np.clip(1 - (self.size / (4 * scale)) ** 2, 0, None)
+        return float((1 - inner**3).sum())
 
 
 def _fit(design: Float64, values: Float64, start: Float64, resolution: float) -> _Fit:
@@ -171,9 +180,13 @@ def _regions(arm: Float64) -> Bool:
 
 
 def _like_neighbours(places: Float64, values: Float64) -> Bool:
-    """Tell which tiles lie near the median of their six neighbours: a start without outliers."""
+    """Tell which tiles are like three of their six neighbours: a start without outliers.
+
+    Along a tear half of a tile's neighbours lie on the other side of it.
+    """
     from scipy.spatial import cKDTree
 
     nearest = cKDTree(places).query(places, k=min(7, len(places)))[1][:, 1:]
-    apart = np.linalg.norm(values - np.median(values[nearest], axis=1), axis=1)
-    return np.asarray(apart <= 5 * max(float(np.median(apart)), 1e-9))
+    apart = np.linalg.norm(values[nearest] - values[:, None], axis=2)
+    third = np.sort(apart, axis=1)[:, 2]
+    return np.asarray(third <= 5 * max(float(np.median(third)), 1e-9))

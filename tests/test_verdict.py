@@ -128,7 +128,7 @@ def test_a_torn_model_shows_two_populations(apart, split):
         tear = find_tear(places, values, 0.005)
         assert tear is not None
         smaller = min(part.mean(), 1 - part.mean())
-        assert abs(tear.share - smaller) < 0.15
+        assert abs(tear.share - smaller) < 0.12
         assert np.hypot(*(np.abs(tear.apart) - np.abs(apart))) < 0.1
 
 
