@@ -42,7 +42,7 @@ from meshreg.report import (
     words,
 )
 from meshreg.report.markup import json_block, number
-from meshreg.types import Grid, Registration, SurveyRaster, Transform
+from meshreg.types import Grid, Registration, SurveyRaster, Transform, Warp
 
 VERDICTS = ("accepted", "review", "rejected")
 HOSTILE = "</script><img src=x onerror=alert(1)>\"'&[red]"
@@ -217,6 +217,13 @@ def test_what_is_not_accepted_comes_with_advice(results: dict[str, Path]) -> Non
     ("reason", "helps"),
     [
         ("the surveys lie 120 m apart, beyond the search radius of 10 m", "--reference-shift"),
+        (
+            "the surveys lie 12 m apart, beyond the search radius of 10 m; bounds and slopes would "
+            "agree if the moving survey were read with --up z: try it",
+            "--up",
+        ),
+        ("the moving survey fits only with east and north exchanged: check its axes", "--axes"),
+        ("the relief recurs upside down, as where one survey's heights are depths: x", "depths"),
         ("the moving survey fits only when mirrored east-west: check its axes", "--axes"),
         ("the moving survey fits just as well when turned by 180°", "--axes"),
         ("the channels contradict each other: image fits elsewhere (x)", "--mask"),
@@ -242,13 +249,27 @@ def test_advice_follows_the_reason(reason: str, helps: str) -> None:
     assert words.next_steps(dataclasses.replace(registration, verdict="accepted")) == ()
 
 
+def test_advice_does_not_speak_of_a_distance_that_other_axes_explain() -> None:
+    reason = "the surveys lie 12 m apart, beyond the search radius of 10 m; "
+    rival = "bounds and slopes would agree if the moving survey were read with --up z: try it"
+    registration = made_registration("rejected")
+    plain, axes = (
+        " ".join(words.next_steps(dataclasses.replace(registration, reason=reason + more)))
+        for more in ("check their shifts (--moving-shift) or search further (x)", rival)
+    )
+    assert "coordinate system" in plain
+    assert "coordinate system" not in axes
+    for text in (plain, axes):
+        assert "search" not in text.lower()  # how far, the reason itself has said
+
+
 def test_every_reason_of_the_judge_has_advice_of_its_own() -> None:
     import meshreg.judge
 
     source = Path(meshreg.judge.__file__).read_text(encoding="utf-8")
     said = re.findall(r'say\(\s*"(?:review|rejected)",\s*f?"([^"]*)"', source)
     assert len(said) >= 7
-    for reason in (text.replace("{turned}", "turned by 90°") for text in said):
+    for reason in (text.replace("{how}", "when turned by 90°") for text in said):
         assert any(re.search(pattern, reason) for pattern, _ in words._ADVICE), reason
 
 
@@ -266,7 +287,39 @@ def test_methods_paragraph_can_stand_in_a_paper(results: dict[str, Path]) -> Non
     assert "  " not in text
     rejected = words.methods_paragraph(made_registration("rejected"))
     assert "No registration was accepted: No offset stands out" in rejected
-    assert "+1.3" not in rejected
+    assert "could not be registered to" in rejected
+    for claim in ("+1.3", "was registered", "refined", "NMAD", "It moves", "sigma"):
+        assert claim not in rejected
+
+
+def test_methods_paragraph_names_the_warp_with_the_nmad_that_belongs_to_it() -> None:
+    rigid = made_registration("accepted")
+    table = np.zeros((4, 4, 3))
+    bent = Warp("quadratic", "dome", np.zeros(2), np.ones(2), table)
+    nmad = f"{rigid.after['height_nmad']:.3f} m"
+    text = words.methods_paragraph(dataclasses.replace(rigid, warp=bent))
+    assert "bent by a smooth warp (quadratic horizontally and dome in height)" in text
+    assert "After registration and warp" in text
+    assert f"NMAD of the height differences there is {nmad}" in text
+    plain = words.methods_paragraph(rigid)
+    assert "warp" not in plain.lower()
+    assert f"After registration {rigid.after['overlap']:.0%}" in plain
+
+
+def test_methods_paragraph_says_what_was_not_determined() -> None:
+    known = made_registration("accepted")
+    assert "not determined" not in words.methods_paragraph(known)
+    covariance = np.array(known.covariance)
+    covariance[2, 2] = 0.94**2
+    worse = {**known.after, "height_nmad": 1.2 * known.before["height_nmad"]}
+    unsure = dataclasses.replace(known, covariance=covariance, after=worse)
+    text = words.methods_paragraph(unsure)
+    assert "The height was not determined: up is known to ± 0.94 m and the heights agree" in text
+    assert "no better than before" in text
+    still = dataclasses.replace(known.transform, rotation=np.eye(3))
+    text = words.methods_paragraph(dataclasses.replace(known, transform=still))
+    sigma = np.rad2deg(np.sqrt(known.covariance[5, 5]))
+    assert f"The yaw was not determined: no turn stood out of its error of {sigma:.4f}°" in text
 
 
 def test_names_are_text_and_nothing_else(tmp_path: Path) -> None:
@@ -286,6 +339,10 @@ def test_names_are_text_and_nothing_else(tmp_path: Path) -> None:
     assert count == [tag for tag, _ in plain.elements if tag in ("script", "img")]
     assert all((a.get("src") or "data:").startswith("data:") for _, a in page.elements)
     assert page.text.count(HOSTILE) >= 8
+    # a key among the settings reaches no page: such a record is refused when it is read
+    foreign = dataclasses.replace(registration, settings={**registration.settings, HOSTILE: 1})
+    with pytest.raises(InputError, match="settings"):
+        made(tmp_path / "foreign", foreign)
 
 
 @given(st.text(), st.text())

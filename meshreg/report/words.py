@@ -22,12 +22,15 @@ _LOOK = (
 _UP_UNKNOWN = 0.14  # m; two depths of 5 cm each, as where nothing tells what sand did
 _ADVICE: tuple[tuple[str, tuple[str, ...]], ...] = (
     (
-        r"lie .* apart",
+        r"surveys lie \S+ m apart",
+        ("The coordinates of the surveys do not meet: report.html shows where they lie.",),
+    ),
+    (
+        # where other axes do not bring them together
+        r"surveys lie \S+ m apart, (?!.* agree if )",
         (
-            "The coordinates of the surveys do not meet: report.html shows where they lie.",
-            "Check the shifts (--reference-shift, --moving-shift: east, north, up in metres that "
-            "are added to a file's coordinates) and the coordinate system of each file.",
-            "If the distance is real, search further: --search-radius with more metres than that.",
+            "Shifts (--reference-shift, --moving-shift) are east, north, up in metres that are "
+            "added to a file's coordinates. Check each file's coordinate system too.",
         ),
     ),
     (
