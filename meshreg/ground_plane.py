@@ -30,10 +30,11 @@ from meshreg.types import Bool, Float64, Transform, UInt8
 
 MIN_BLOCKS = 12
 # m: algal turf is several millimetres to centimetres tall (Connell, Foster and Airoldi, Marine
-# Ecology Progress Series 495, 2014, doi:10.3354/meps10513); 2 cm is our assumption, not a figure of
-# theirs. Its mean may have grown or gone by anything up to that: the deviation
-# of a rectangular distribution (Guide to the Expression of Uncertainty in Measurement, 4.3.7).
-COVER = 0.02 / np.sqrt(3)
+# Ecology Progress Series 495, 2014, doi:10.3354/meps10513). Its mean over the ground may have
+# grown or gone by 1 cm, which is our assumption, not a figure of theirs, or by anything less: the
+# deviation of a rectangular distribution (Guide to the Expression of Uncertainty in Measurement,
+# 4.3.7).
+COVER = 0.01 / np.sqrt(3)
 NODES = 300  # places that stand for the ground, seen or not
 LEAST_STEP = 0.1  # cells: what parts two blocks that did not change alike is higher than that
 # What a cell of ground was for the height and the tilt: not compared; changed, or without detail

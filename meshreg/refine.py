@@ -174,12 +174,12 @@ def _explained(tiles: TileOffsets, rough: Refined) -> Bool:
 def relief_height(
     reference: SurveyRaster, moving: SurveyRaster, offset: tuple[float, float]
 ) -> float:
-    """Rms height [m] of the ground about its surroundings (`RELIEF_CELLS`), as both surveys have it.
+    """Rms height [m] of the ground about its surroundings (`RELIEF_CELLS`), as far as it recurs.
 
     By so much light can displace what an image shows: a shadow's edge lies a height away from the
     edge that casts it where the light stands at 45°, on its other side if the light does; and all
     tiles are displaced alike, so that their scatter does not tell. The covariance of both surveys'
-    heights has none of their noise in it; two of its sigmas are added. 0 where nothing has a height.
+    heights has none of their noise in it; two of its sigmas are added. 0 where no height is known.
     """
     overlap = Overlap.at(reference.grid, moving.grid, offset)
     if overlap.side < 1:

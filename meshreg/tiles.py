@@ -164,7 +164,7 @@ def _tile_spectra(
     reach: int,
     cell: float,
 ) -> tuple[neutral.Spectra, neutral.Spectra, Correlator] | None:
-    """Transforms of a moving tile and of the reference about it; None where half is unknown.
+    """Transform a moving tile and the reference about it; None where half is unknown.
 
     The window's east and north are from the common shift.
     """
@@ -235,7 +235,7 @@ def spread_of_fields(
         found = [part for part in several.map(stacked, range(len(some))) if part is not None]
     if not found:
         return np.zeros((2, 2))
-    along = np.arange(-STACK_REACH, STACK_REACH + 1) * cell
+    along = np.arange(-STACK_REACH, STACK_REACH + 1).astype(np.float64) * cell
     away = np.hypot(along[None, :], along[:, None])
     ring = away > 0.6 * STACK_REACH * cell
     stack = np.sum(found, axis=0)

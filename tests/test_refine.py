@@ -25,6 +25,7 @@ from meshreg.refine import (
 )
 from meshreg.tiles import TileOffsets
 from meshreg.types import Grid, SurveyRaster, Transform
+from meshreg.verdict import MOST_UNDECIDED
 
 OFFSET = (1.237, -2.412)
 REEF = Path(__file__).parent / "data" / "reef_dem" / "horseshoe_dem.tif"
@@ -445,3 +446,50 @@ def test_light_from_two_sides_is_in_the_error_bar_of_an_image(seed):
     both = refine(used, start, np.eye(2) * 0.05**2, 0.3)
     assert np.sqrt(np.trace(both.covariance[:2, :2]) / 2) < 0.3 * sigma
     assert np.hypot(*(both.offset - truth)) < 0.1 * 0.05
+
+
+def spectral(rng, side, slope, longest):
+    """Gaussian random field (side, side) of unit deviation, its spectrum flat beyond `longest`."""
+    k = np.hypot(*np.meshgrid(np.fft.fftfreq(side), np.fft.fftfreq(side)))
+    amplitude = np.maximum(k, 1 / longest) ** (-slope / 2)
+    field = np.fft.ifft2(np.fft.fft2(rng.normal(size=(side, side))) * amplitude).real
+    return (field - field.mean()) / field.std()
+
+
+def lit_sheets(seed, turned, albedo, cell=0.05, side=360):
+    """Two pictures on level sheets, of one relief lit from two sides; truth (0.2, -0.15) m."""
+    rng = np.random.default_rng(seed)
+    whole = side + 80
+    height, paint = 0.05 * spectral(rng, whole, 3.0, 40), spectral(rng, whole, 2.0, 20)
+    d_north, d_east = np.gradient(height, -cell, cell)
+    sheets = []
+    for azimuth, (row, col) in ((20, (40, 40)), (20 + turned, (37, 36))):
+        sun = np.array([np.sin(np.deg2rad(azimuth)), np.cos(np.deg2rad(azimuth)), 0.84])
+        light = np.maximum(sun[2] - sun[0] * d_east - sun[1] * d_north, 0)
+        light = light / np.sqrt(1 + d_east**2 + d_north**2) * (1 + 0.25 * albedo * paint)
+        grey = 110 * light / light.mean() + rng.normal(0, 3, light.shape)
+        grey = np.clip(grey, 0, 255)[row : row + side, col : col + side].astype(np.uint8)
+        known = np.ones((side, side), bool)
+        grid = Grid(0.0, side * cell, cell, (side, side))
+        color = np.repeat(grey[..., None], 3, axis=2)
+        level, ones = np.zeros(known.shape, np.float32), np.ones(known.shape, np.uint16)
+        sheets.append(SurveyRaster(grid, level, color, known, known, ones))
+    return sheets, np.array([-4 * cell, 3 * cell])
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("turned", [0, 60, 90, 180])
+@pytest.mark.parametrize("albedo", [0.0, 0.3, 1.0])
+def test_shading_lit_from_another_side_is_in_the_error_bar_or_undecided(seed, turned, albedo):
+    (still, moving), truth = lit_sheets(seed, turned, albedo)
+    found = refine([(still, moving, "image")], tuple(truth), np.eye(2) * 0.1**2, 0.5)
+    if found.undecided > MOST_UNDECIDED:
+        assert turned >= 60, "one light decides"
+        return
+    if found.tiles is None:  # too few tiles have a peak: the judged sigma stands
+        return
+    miss = found.offset - truth
+    assert miss @ np.linalg.solve(found.covariance[:2, :2], miss) < 3.5**2
+    if turned == 0:
+        assert found.undecided < 0.05
+        assert np.hypot(*miss) < 0.05 * 0.05
