@@ -13,6 +13,7 @@ from meshreg import Mesh, PointCloud, Settings, Survey, apply_transform, registe
 from meshreg.errors import UsageError
 from meshreg.heights import STABLE, rotation
 from meshreg.statistics import registration_sigma
+from meshreg.surfaces import Polished
 from meshreg.types import Transform
 
 OFFSET = np.array([1.337, -2.412, 0.083])
@@ -106,6 +107,22 @@ def test_a_tilted_survey_is_levelled():
     at = registration_sigma(found, *found.registration_error["at"])
     np.testing.assert_allclose([found.registration_error[axis] for axis in "xyz"], at, rtol=1e-9)
     assert (stated[:, 2] > at[2]).all()  # a tilt's doubt grows with the lever
+
+
+@pytest.mark.parametrize(("degrees", "codes"), [(9.5, []), (10.5, ["lean"])])
+def test_the_tilt_that_counts_is_that_after_the_surfaces(monkeypatch, degrees, codes):
+    first, later = floors()
+
+    def tilted(reference, moving, transform, place, error, stable, seed, *, kind):
+        assert np.abs(transform.rotation[2, :2]).max() < 0.02
+        turned = rotation([np.deg2rad(degrees), 0.0]) @ transform.rotation
+        return Polished(dataclasses.replace(transform, rotation=turned), True, 0.0, 0.1, 0.1, "x")
+
+    monkeypatch.setattr("meshreg.pipeline.polish", tilted)
+    pair = survey(first, half=2.5, step=0.05, seed=1), displaced(survey(later, half=2.5, step=0.05))
+    found = register_pair(pair[0], pair[1][0], QUICK.changed({"refine.surfaces": "gicp"}))
+    assert [finding.code for finding in found.findings] == codes
+    assert found.verdict == ("review" if codes else "accepted")
 
 
 @pytest.mark.needs("small_gicp")

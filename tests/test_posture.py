@@ -11,7 +11,7 @@ import pytest
 from test_pipeline import QUICK, displaced, floors
 from test_pipeline import survey as ground
 
-from meshreg import PointCloud, Survey, register_pair
+from meshreg import Mesh, PointCloud, Survey, register_pair
 from meshreg.io.framing import ENU, NED, Y_UP
 from meshreg.posture import AXES, in_degrees, level_axes, other_axes, posture
 from meshreg.types import Frame, Grid, Maps, SourceFile
@@ -217,3 +217,25 @@ def test_axes_that_bounds_cannot_tell_are_told_by_image_and_relief(axes, name, r
     assert found.verdict != "accepted"
     said = next(finding.said for finding in found.findings if finding.code == "axes")
     assert f"would agree if the moving survey were read with {name} in" in said
+
+
+def test_a_narrow_strip_is_registered_and_nothing_else_is_said_of_it():
+    """1.2 m wide and 16 m long: as narrow as its relief is high, and still no file on its side."""
+    first, later = floors()
+
+    def cut(floor, seed):
+        whole = ground(floor, half=8.0, step=0.05, seed=seed).geometry
+        kept = np.abs(whole.vertices[:, 0]) < 0.6
+        number = np.cumsum(kept) - 1
+        faces = number[whole.faces[kept[whole.faces].all(axis=1)]]
+        return Survey("strip", Mesh(whole.vertices[kept], faces, whole.colors[kept]))
+
+    reference = cut(first, 1)
+    moving, truth = displaced(cut(later, 2))
+    found = register_pair(reference, moving, QUICK)
+    assert found.verdict == "accepted", found.reason
+    assert not found.findings
+    assert not any("up" in note.split() or "tilted" in note for note in found.notes)
+    off = found.transform.apply(moving.centre) - truth.apply(moving.centre)
+    assert np.abs(off[:2]).max() < 0.02
+    assert abs(off[2]) < 0.05
