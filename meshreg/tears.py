@@ -180,13 +180,13 @@ def _regions(arm: Float64) -> Bool:
 
 
 def _like_neighbours(places: Float64, values: Float64) -> Bool:
-    """Tell which tiles are like three of their six neighbours: a start without outliers.
+    """Tell which tiles are like two of their six neighbours: a start without outliers.
 
-    Along a tear half of a tile's neighbours lie on the other side of it.
+    Of a row of tiles between a tear and the survey's edge no more lie on their own side.
     """
     from scipy.spatial import cKDTree
 
     nearest = cKDTree(places).query(places, k=min(7, len(places)))[1][:, 1:]
     apart = np.linalg.norm(values[nearest] - values[:, None], axis=2)
-    third = np.sort(apart, axis=1)[:, 2]
-    return np.asarray(third <= 5 * max(float(np.median(third)), 1e-9))
+    second = np.sort(apart, axis=1)[:, 1]
+    return np.asarray(second <= 5 * max(float(np.median(second)), 1e-9))

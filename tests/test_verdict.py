@@ -13,6 +13,7 @@ from meshreg import Mesh, PointCloud, Survey, register_pair
 from meshreg.dem_pair import DemPair
 from meshreg.errors import InputError
 from meshreg.gain import Gain, relief_gain
+from meshreg.heights import fit_heights
 from meshreg.judge import Judgement
 from meshreg.layers import second_surface
 from meshreg.raster import rasterize
@@ -56,6 +57,7 @@ def test_the_gain_is_one_where_ground_changes(change):
         assert abs(np.log(gain.value)) < max(3 * gain.sigma, 0.05)
 
 
+# A gain of 1.1 departs by a tenth; with up to 6 % of sigma here, three of them make that 1.2.
 @pytest.mark.parametrize("times", [0.7, 1.3, 2.0])
 def test_a_gain_is_recovered_with_its_error(times):
     for seed in (0, 1):
@@ -115,11 +117,11 @@ def lattice(count=6, side=12.0):
 
 
 @pytest.mark.parametrize("apart", [(0.34, 0.0), (-0.15, 0.2), (1.0, 0.4)])
-@pytest.mark.parametrize("split", ["half", "diagonal", "strip"])
+@pytest.mark.parametrize("split", ["half", "diagonal", "strip", "rim"])
 def test_a_torn_model_shows_two_populations(apart, split):
     places = lattice()
     x, y = places.T / 12.0
-    part = {"half": x > 0.5, "diagonal": x + y > 1.1, "strip": x < 0.3}[split]
+    part = {"half": x > 0.5, "diagonal": x + y > 1.1, "strip": x < 0.3, "rim": y < 0.16}[split]
     for seed in range(5):
         rng = np.random.default_rng(seed)
         values = bent(places, rng, 0.03) + rng.normal(0, 0.01, (36, 2))
@@ -142,6 +144,26 @@ def test_a_smooth_bend_is_no_tear():
     dome = ((places - 6.0) ** 2).sum(axis=1)[:, None] * 0.2 / 72
     dome += np.random.default_rng(0).normal(0, 0.01, (36, 1))
     assert find_tear(places, dome, 0.002) is None
+
+
+@pytest.mark.parametrize(("share", "apart"), [(0.5, 0.2), (0.5, -0.3), (0.2, -0.4), (0.0, 0.0)])
+def test_a_step_in_height_is_found_and_a_bend_is_none(share, apart):
+    for seed in (0, 1):
+        floor = seafloor.Seafloor.random(seed, size=18.0)
+        still = floor.raster(0.1, 6.0, noise=0.003, seed=seed)
+        later = floor.changed(seed + 1, 0.2).raster(0.1, 6.0, noise=0.003, seed=seed + 9)
+        row, col = np.mgrid[:120, :120]
+        bend = 0.05 * np.cos(row / 50 + seed) * np.sin(col / 45)
+        part = col >= round(120 * (1 - share))
+        height = (later.height + bend + apart * part).astype(np.float32)
+        step = fit_heights(still, dataclasses.replace(later, height=height), Transform()).step
+        if not share:
+            assert step is None
+            continue
+        assert step.size == pytest.approx(abs(apart), abs=0.03)
+        assert step.share == pytest.approx(share, abs=0.12)
+        # added to the eastern part: what it is too high by, downwards; of two halves either is told
+        assert (step.apart[0] * apart < 0) == ("east" in step.side)
 
 
 def test_half_a_model_that_slid_is_reviewed():
