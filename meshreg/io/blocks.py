@@ -17,7 +17,7 @@ from meshreg.io.mover import Mover, is_plain
 from meshreg.io.naming import Planned, planned
 from meshreg.io.options import ReadOptions
 from meshreg.io.safe import data_errors, fingerprint, sha256
-from meshreg.io.sidecar import write_shift
+from meshreg.io.sidecar import write_metadata, write_shift
 from meshreg.types import Float64, Frame, SourceFile, Survey, Transform, Warp
 
 __all__ = ["Block", "find_blocks", "read_block", "require_warpable", "require_writable", "rewrite"]
@@ -129,4 +129,6 @@ def rewrite(
         if source.format != "maps":
             in_file = source.format == "e57" or (source.format == "las" and is_plain(target))
             written += write_shift(path, target, carries_crs=in_file)
+            if source.sidecar is not None and source.sidecar.name == "metadata.xml":
+                written += write_metadata(path, target)
     return tuple(dict.fromkeys(written))

@@ -39,6 +39,8 @@ _FOREIGN = (
     (b"Kaydara FBX", "FBX"),
     (b"<", "XML (COLLADA, X3D, VRT or the like)"),
 )
+_TILED, _TILESET = (".b3dm", ".i3dm", ".pnts", ".cmpt", ".3tz"), "tileset.json"  # 3D Tiles
+_UNTILED = "Export the model as .obj or .glb, or the cloud as .las or .ply, and give that."
 _UNPACK = "Unpack or convert it, and give the survey file itself."
 # What a folder is taken for: the first row with a file in it; mixtures within a row are refused.
 _FOLDER_RANKS = (
@@ -195,6 +197,8 @@ def _file_block(path: Path) -> Block:
     for magic, name in _FOREIGN:
         if start.startswith(magic):
             raise InputError(f"is {name}, which is not read.", file=path, remedy=_UNPACK)
+    if suffix in _TILED or path.name.lower() == _TILESET:
+        raise InputError("is a part of 3D Tiles, which are not read.", file=path, remedy=_UNTILED)
     if not suffix or suffix not in READERS:
         raise InputError(
             f"has a suffix {path.suffix!r} that is not known.",
@@ -238,6 +242,8 @@ def _folder_blocks(folder: Path) -> tuple[Block, ...]:
         return tuple(
             replace(block, below=True) for block in _one_format(_inside(tiles, folder), folder)
         )
+    if (folder / _TILESET).is_file():
+        raise InputError("holds 3D Tiles, which are not read.", file=folder, remedy=_UNTILED)
     raise InputError(
         "is a folder without a survey file in it.",
         file=folder,

@@ -18,9 +18,9 @@ from meshreg.io import sidecar_readers as readers
 from meshreg.io.options import ReadOptions
 from meshreg.io.safe import beside, require_inside
 from meshreg.io.sidecar_readers import SidecarInfo, join
-from meshreg.io.sidecar_write import write_shift
+from meshreg.io.sidecar_write import write_metadata, write_shift
 
-__all__ = ["SidecarInfo", "find_sidecar", "is_sidecar", "join", "write_shift"]
+__all__ = ["SidecarInfo", "find_sidecar", "is_sidecar", "join", "write_metadata", "write_shift"]
 
 _ODM_FOLDER = "odm_georeferencing"
 _ODM_NAMES = ("coords.txt", "odm_georeferencing_model_geo.txt")

@@ -58,6 +58,39 @@ def write_shift(path: Path, frame: Frame, *, carries_crs: bool = False) -> tuple
     return tuple(written)
 
 
+def write_metadata(path: Path, frame: Frame) -> tuple[Path, ...]:
+    """Write a metadata.xml beside `path`, as ContextCapture and DJI Terra read it.
+
+    Programs that know no other side file open the survey where it lies by it.
+
+    Parameters
+    ----------
+    path : Path
+        The survey file.
+    frame : Frame
+
+    Returns
+    -------
+    tuple of Path
+        Nothing where the file's axes or unit are others than that one may say, or its CRS is not
+        known.
+    """
+    from xml.sax.saxutils import escape
+
+    if frame.file_crs is None or _frame_words(frame):
+        return ()
+    origin = ",".join(f"{value:.17g}" for value in frame.shift)
+    beside = path.with_name("metadata.xml")
+    with atomic_file(beside) as temporary:
+        temporary.write_text(
+            '<?xml version="1.0" encoding="utf-8"?>\n<ModelMetadata version="1">\n'
+            f"  <SRS>{escape(frame.file_crs)}</SRS>\n"
+            f"  <SRSOrigin>{origin}</SRSOrigin>\n</ModelMetadata>\n",
+            "utf-8",
+        )
+    return (beside,)
+
+
 def _remove(path: Path) -> None:
     try:
         path.unlink(missing_ok=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
+from xml.etree import ElementTree
 
 import numpy as np
 import pyproj
@@ -75,6 +76,38 @@ def test_a_production_of_tiles_is_read_and_written_with_its_place(tmp_path):
     again = read_survey([path for path in files if path.suffix == ".obj"])
     assert again.bounds == pytest.approx(survey.bounds + MOVE.offset, abs=1e-6)
     assert again.crs == CRS
+
+
+def test_a_metadata_xml_comes_with_the_registered_survey(tmp_path):
+    """Of programs that know no other side file; its origin is that of the file as it is written."""
+    path, home = obj(tmp_path / "in/reef.obj"), obj(tmp_path / "home/first.obj")
+    (tmp_path / "in/metadata.xml").write_text(metadata(CRS, "731000,5705000,12.5"))
+    (tmp_path / "home/first.survey.toml").write_text(f'shift = [730000, 5704000, 0]\ncrs = "{CRS}"')
+    survey = read_survey(path)
+    for reference, shift in ((None, SHIFT), (read_survey(home), (730_000, 5_704_000, 0))):
+        out = tmp_path / f"out{reference is None}"
+        files = rewrite_survey(survey, MOVE, out, reference)
+        assert out / "metadata.xml" in files
+        text = (out / "metadata.xml").read_text()
+        said = {word.tag: word.text for word in ElementTree.fromstring(text)}
+        assert [float(value) for value in said["SRSOrigin"].split(",")] == pytest.approx(shift)
+        assert pyproj.CRS(said["SRS"]) == pyproj.CRS(CRS)
+        for beside in (*out.glob("*.toml"), *out.glob("*_offset.xyz")):
+            beside.unlink()
+        again = read_survey(next(file for file in files if file.suffix == ".obj"))
+        assert absolute(again) == pytest.approx(absolute(survey) + MOVE.offset, abs=1e-6)
+        assert again.crs == CRS
+    plain = rewrite_survey(read_survey(home), MOVE, tmp_path / "plain")
+    assert not any(file.name == "metadata.xml" for file in plain)
+
+
+def test_tiles_of_a_tileset_are_named_with_what_to_do(tmp_path):
+    (tmp_path / "tileset.json").write_text('{"geometricError": 1, "root": {}}')
+    (tmp_path / "a.b3dm").write_bytes(b"b3dm")
+    for given in (tmp_path, tmp_path / "tileset.json", tmp_path / "a.b3dm"):
+        with pytest.raises(InputError, match="3D Tiles, which are not read") as raised:
+            read_survey(given)
+        assert "Export the model as .obj or .glb" in raised.value.remedy
 
 
 def test_a_metadata_xml_of_another_layout_is_named_only(tmp_path):
