@@ -38,7 +38,7 @@ class RasterizeRequest:
 def rasterize(request: RasterizeRequest, voice: Voice, unfinished: Unfinished) -> dict[str, Any]:
     """Write dem.tif and ortho.tif of one survey; say what they are."""
     from meshreg.io.manifest import require_apart, survey_files
-    from meshreg.io.maps import write_raster
+    from meshreg.io.maps import local_crs, write_raster
     from meshreg.raster import rasterize as make_raster
     from meshreg.raster.grid import choose_cells, survey_grid
 
@@ -68,7 +68,7 @@ def rasterize(request: RasterizeRequest, voice: Voice, unfinished: Unfinished) -
             if what == "color" and not seen.any():
                 LOG.warning("%s has no colour; no orthomosaic is written.", survey.name)
                 continue
-            write_raster(raster, folder / f"{name}.tif", what)
+            write_raster(raster, folder / f"{name}.tif", what, local_crs(survey))
             maps[name] = {
                 "file": str(request.out / f"{name}.tif"),
                 "cell": raster.grid.cell,

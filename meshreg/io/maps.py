@@ -241,8 +241,22 @@ def rewrite(source: SourceFile, move: Mover, path: Path) -> tuple[Path, ...]:
     return (path,)
 
 
+def local_crs(survey: Survey | None) -> str | None:
+    """Return the WKT of the local CRS in which a survey's maps lie; None where there is none.
+
+    Maps are in metres: a local system in another unit is not theirs.
+    """
+    if survey is None or survey.crs is not None or not survey.source:
+        return None
+    frame = survey.source[0].frame
+    return frame.local if abs(abs(np.linalg.det(frame.axes)) - 1) < 1e-9 else None
+
+
 def write_raster(
-    raster: SurveyRaster, path: Path, what: Literal["height", "color"] = "height"
+    raster: SurveyRaster,
+    path: Path,
+    what: Literal["height", "color"] = "height",
+    local: str | None = None,
 ) -> None:
     """Write a rasterized survey's DEM or orthomosaic as a cloud-optimised GeoTIFF.
 
@@ -253,6 +267,8 @@ def write_raster(
     what : "height" or "color"
         Float32 heights (absolute: `datum` added; no data -9999), or 8-bit red, green, blue with an
         alpha band.
+    local : str, optional
+        WKT of the local CRS that they are in (`local_crs`), where they have none on Earth.
 
     Raises
     ------
@@ -260,10 +276,11 @@ def write_raster(
         It could not be written, or did not read back as written.
     """
     if what == "color":
-        write_color(raster.color, raster.color_valid, raster.grid, path)
+        write_color(raster.color, raster.color_valid, raster.grid, path, local=local)
     else:
         height = (raster.height.astype(np.float64) + raster.datum).astype(np.float32)
-        write_height(np.where(raster.valid, height, np.float32(np.nan)), raster.grid, path)
+        height = np.where(raster.valid, height, np.float32(np.nan))
+        write_height(height, raster.grid, path, local=local)
 
 
 def write(survey: Survey, path: Path) -> tuple[Path, ...]:

@@ -84,7 +84,7 @@ def write_record_files(
 
     registration = with_frames(registration, reference, moving)
     written = [_write_text(folder / "settings.toml", tomli_w.dumps(dict(registration.settings)))]
-    written += _write_maps(registration, folder)
+    written += _write_maps(registration, folder, reference)
     transform = registration.transform
     if transform is not None:
         text = matrix_text(transform.matrix)
@@ -133,9 +133,9 @@ def _write_text(path: Path, text: str) -> Path:
     return path
 
 
-def _write_maps(registration: Registration, folder: Path) -> list[Path]:
+def _write_maps(registration: Registration, folder: Path, reference: Survey | None) -> list[Path]:
     """Write both surveys after registration, on one grid; a rejected pair has none to show."""
-    from meshreg.io.maps import write_raster
+    from meshreg.io.maps import local_crs, write_raster
 
     written: list[Path] = []
     if registration.transform is None:
@@ -146,7 +146,7 @@ def _write_maps(registration: Registration, folder: Path) -> list[Path]:
         if raster is None or not (is_height or raster.color_valid.any()):
             continue
         path = folder / f"{name}.tif"
-        write_raster(raster, path, "height" if is_height else "color")
+        write_raster(raster, path, "height" if is_height else "color", local_crs(reference))
         written.append(path)
     return written
 

@@ -453,3 +453,26 @@ def test_a_geocentric_reference_makes_no_other_file_geocentric(tmp_path):
     assert absolute(again) == pytest.approx(flat + MOVE.offset, abs=1e-5)
     z = [float(line.split()[3]) for line in files[0].read_text().splitlines() if line[:2] == "v "]
     assert np.ptp(z) == pytest.approx(2, abs=1e-6)  # as steep as it was: axes east, north, up
+
+
+@pytest.mark.parametrize(("unit", "carried"), [("m", True), ("ft", False)])
+def test_maps_made_of_a_survey_are_in_its_local_crs(tmp_path, unit, carried):
+    """Maps are in metres, so that a system whose numbers were feet is not theirs."""
+    import rasterio
+    from made_registration import made_registration
+
+    from meshreg import cli
+    from meshreg.io import ReadOptions
+    from meshreg.io.record import write_record_files
+
+    path = obj(tmp_path / "in/reef.obj")
+    axes = 'AXIS["E",EAST],AXIS["N",NORTH]'
+    wkt = f'LOCAL_CS["Site grid",LOCAL_DATUM["Site",0],UNIT["metre",1],{axes}]'
+    path.with_suffix(".prj").write_text(wkt)
+    words = ["rasterize", str(path), "-o", str(tmp_path / "maps"), "--unit", unit]
+    assert cli.run(words) == 0
+    survey = read_survey(path, ReadOptions(unit=unit))
+    write_record_files(made_registration("accepted"), tmp_path, reference=survey)
+    for name in ("maps/dem.tif", "reference_dem.tif", "moving_ortho.tif"):
+        with rasterio.open(tmp_path / name) as raster:
+            assert (raster.crs is not None and "Site grid" in raster.crs.to_wkt()) == carried
