@@ -137,7 +137,24 @@ def read_survey(
     surveys = [blocks.read_block(block, options) for block in found]
     if len(found) > 1 and found[0].below:
         merging.require_apart(surveys, path)
-    return without_repeats(surveys[0] if len(surveys) == 1 else merging.merge(surveys, path))
+    survey = surveys[0] if len(surveys) == 1 else merging.merge(surveys, path)
+    _require_near(survey)
+    return without_repeats(survey)
+
+
+def _require_near(survey: Survey) -> None:
+    """Refuse coordinates beyond measure, whichever reader they came through."""
+    import numpy as np
+
+    from meshreg.io.safe import FARTHEST
+
+    farthest = float(np.abs(survey.bounds).max())
+    if not farthest < FARTHEST:  # NaN too
+        raise InputError(
+            f"has coordinates of up to {farthest:.3g} m; {FARTHEST:g} is the limit.",
+            file=survey.source[0].path if survey.source else None,
+            remedy="Check its unit, shift and camera positions, or export it again.",
+        )
 
 
 def write_survey(survey: Survey, path: str | Path) -> tuple[Path, ...]:

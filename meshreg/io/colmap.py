@@ -19,11 +19,11 @@ from meshreg.io.bridge import bridge
 from meshreg.io.colmap_files import PARTS, Model, ModelFiles, find_model, read_model
 from meshreg.io.colmap_write import ModelMove, check_moved, text_kept, write_moved
 from meshreg.io.crs import crs_name, crs_text, is_geographic, metric_crs
-from meshreg.io.frames import Placed, place
+from meshreg.io.frames import Placed, place, require_near
 from meshreg.io.mover import Mover
 from meshreg.io.options import ReadOptions
 from meshreg.io.positions import Positions, exif_positions, match_names, read_positions
-from meshreg.io.safe import atomic_folder, fingerprint, open_regular
+from meshreg.io.safe import FARTHEST, atomic_folder, fingerprint, open_regular
 from meshreg.io.sidecar import SidecarInfo, find_sidecar
 from meshreg.io.similarity import (
     MAX_TILT,
@@ -126,7 +126,7 @@ def _require_consistent(options: ReadOptions) -> None:
 
 def _kept(model: Model, notes: list[str]) -> Any:
     """Return which points are sound; all of them where few would be left."""
-    finite = np.isfinite(model.points).all(axis=1)
+    finite = (np.abs(model.points) < FARTHEST).all(axis=1)
     poor = finite & ((model.errors > MAX_ERROR) | (model.tracks < MIN_TRACK))
     kept = finite & ~poor
     if kept.sum() < max(100, 0.25 * finite.sum()):
@@ -161,6 +161,7 @@ def _place(
         frame = _frame_by_positions(model, positions, level, options, notes)
         origin = np.round(points.mean(axis=0) @ frame.axes.T + frame.shift)
         moved = points @ frame.axes.T + (frame.shift - origin)
+        require_near(moved + origin)
         return Placed(moved, origin, frame, (), said.path, said.name, said.date), True
     known = bool({"unit", "shift"} & set(stated))
     scale = options.scale or 1.0

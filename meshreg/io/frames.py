@@ -104,7 +104,7 @@ def place(
     try:
         frame = frame_from(options, sidecar, file_crs, default_axes, centre=centre)
         corners = np.array(list(itertools.product(*ends.T)), float)
-        _require_near(to_absolute(frame, corners) if frame.is_linear else corners)
+        require_near(to_absolute(frame, corners) if frame.is_linear else corners)
         origin = np.round(to_absolute(frame, centre[None])[0])
         points = _from_origin(frame, xyz, origin)
         notes += _frame_notes(options, sidecar, frame, centre)
@@ -119,7 +119,7 @@ def place(
     return Placed(points, origin, frame, notes, said.path, said.name, said.date)
 
 
-def _require_near(corners: Float64) -> None:
+def require_near(corners: Float64) -> None:
     """Refuse absolute coordinates (N, 3) at which float64 no longer tells millimetres apart."""
     farthest = float(np.abs(corners).max())
     if not farthest < FARTHEST:

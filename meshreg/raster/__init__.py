@@ -15,7 +15,7 @@ import numpy as np
 from meshreg.errors import UsageError
 from meshreg.raster.cloud import draw_cloud
 from meshreg.raster.finish import Layers, finished
-from meshreg.raster.grid import check_size, choose_cells, survey_grid
+from meshreg.raster.grid import check_size, choose_cells, require_together, survey_grid
 from meshreg.raster.maps import draw_maps
 from meshreg.raster.mesh import draw_mesh
 from meshreg.raster.placing import place
@@ -65,7 +65,8 @@ def rasterize(
     Raises
     ------
     InputError
-        If the survey has no surface, or no two of its points lie apart.
+        If the survey has no surface, no two of its points lie apart, or a few lie so far from the
+        others that nearly all of its raster would be empty.
     UsageError
         If the grid's and the survey's CRS differ, or the mask has another shape than the grid.
     ResourceLimitError
@@ -81,6 +82,7 @@ def rasterize(
             f"The grid is in {grid.crs}, {survey.name} in {survey.crs}.",
             remedy="Bring the survey to the grid's CRS first (meshreg.io.frames.reframe).",
         )
+    require_together(survey, grid.cell)
     check_size(grid, settings.max_cells)
     layers, texel, datum = _layers(survey, grid, settings, transform, spacing)
     raster = finished(layers, grid, settings, texel, datum, mask, transform)

@@ -8,10 +8,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from meshreg.errors import ResourceLimitError, UsageError
+from meshreg.errors import InputError, ResourceLimitError, UsageError
 from meshreg.raster.cells import Cells, choose_cells
 from meshreg.raster.spacing import Spacing, measure_spacing, rounded, survey_bounds
-from meshreg.types import Float64, Grid, Survey, SurveyRaster, Transform
+from meshreg.types import Float64, Grid, Maps, Survey, SurveyRaster, Transform
 
 __all__ = [
     "Cells",
@@ -22,6 +22,7 @@ __all__ = [
     "coarsened",
     "common_grid",
     "measure_spacing",
+    "require_together",
     "survey_bounds",
     "survey_grid",
     "survey_grids",
@@ -29,6 +30,9 @@ __all__ = [
 
 LEAST_SHARE = 0.5  # a cell with data on less of its area is empty: the mean would sit to one side
 _BYTES_PER_CELL = 11  # of a SurveyRaster
+_BLOCK = 512  # cells: the side of a GeoTIFF's tile, of which even an empty one is written
+_APART = 64  # times the cells that all but a hundredth of the points would need
+_LOOKED_AT = 100_000  # points
 
 
 def survey_grid(
@@ -95,6 +99,56 @@ def check_size(grid: Grid, max_cells: int) -> None:
             remedy="Choose larger cells (--dem-cell, --ortho-cell, --sift-cell), look for stray "
             "points far away, or raise it (--set raster.max_cells=...).",
         )
+
+
+def require_together(survey: Survey, cell: float) -> None:
+    """Refuse a survey whose lattice would be enormous for the sake of a few points far away.
+
+    A raster's cost grows with the box around all points, whatever lies in it. The box around all
+    but a hundredth of them (half of it at each end, by coordinate) is compared, both in whole
+    blocks of 512 × 512 cells.
+
+    Raises
+    ------
+    InputError
+        If the one is over 64 times the other, with the points that make it so.
+    """
+    if isinstance(survey.geometry, Maps):
+        return
+    points = survey.geometry.points
+    bounds = survey_bounds(survey)
+    sample = points[:: max(1, len(points) // _LOOKED_AT), :2]
+    sample = sample[np.isfinite(sample).all(axis=1)]
+    # by rank, so that of a handful of points one is left out at each end as well
+    low, high = np.quantile(sample, (0.005, 0.995), axis=0, method="closest_observation")
+    if len(sample) > 8:
+        low = np.maximum(low, np.partition(sample, 1, axis=0)[1])
+        high = np.minimum(high, np.partition(sample, -2, axis=0)[-2])
+    middle = np.array([low, high]) + survey.origin[:2]
+    if _blocks(bounds[:, :2], cell) <= _APART * _blocks(middle, cell):
+        return
+    side = np.maximum(high - low, cell)
+    far = np.flatnonzero(((points[:, :2] < low - side) | (points[:, :2] > high + side)).any(axis=1))
+    whole, most = np.ptp(bounds[:, :2], axis=0), np.ptp(middle, axis=0)
+    first = "" if not len(far) else f", the first of them at {_place(survey, int(far[0]))}"
+    raise InputError(
+        f"{survey.name} lies within {most[0]:.6g} m × {most[1]:.6g} m but for {len(far):,} of "
+        f"{len(points):,} points far away{first}: its raster would be {whole[0]:.6g} m × "
+        f"{whole[1]:.6g} m in cells of {cell:g} m, nearly all of them empty.",
+        file=survey.source[0].path if survey.source else None,
+        remedy="Remove the far points in the program that made the file.",
+    )
+
+
+def _blocks(ends: Float64, cell: float) -> float:
+    return float(np.prod(np.ceil(np.maximum(np.ptp(ends, axis=0) / cell, 1) / _BLOCK)))
+
+
+def _place(survey: Survey, row: int) -> str:
+    """Say where a point lies: absolute east and north."""
+    assert not isinstance(survey.geometry, Maps)
+    east, north = (survey.geometry.points[row] + survey.origin)[:2]
+    return f"{east:.10g} m east, {north:.10g} m north"
 
 
 def cell_offset(a: Grid, b: Grid) -> tuple[int, int]:

@@ -10,6 +10,7 @@ import numpy as np
 from meshreg.errors import InputError
 from meshreg.types import Float64, Maps, Mesh, PointCloud, Survey, Transform, ends
 
+CLOSEST = 1e-9  # m; nearer points are one place in numbers that hold a survey's
 _SAMPLE = 50_000  # faces or points looked at; every n-th, so that the answer is repeatable
 
 
@@ -63,7 +64,7 @@ def _measured(survey: Survey) -> Spacing:
     else:
         points = _edge(geometry)
         texels = median_texel(*texel_sizes(geometry)[1:])
-    if points is None:
+    if points is None or not (points >= CLOSEST and _extent(geometry.points) >= CLOSEST):
         raise InputError(
             f"{survey.name} covers no ground: its points lie in one place or on one line.",
             file=survey.source[0].path if survey.source else None,
@@ -71,6 +72,11 @@ def _measured(survey: Survey) -> Spacing:
         )
     gridded = isinstance(geometry, PointCloud) and _on_a_grid(geometry.points, points)
     return Spacing(points, texels, gridded)
+
+
+def _extent(points: Float64) -> float:
+    """Return the shorter side [m] of the box around finite points, seen from above."""
+    return float(np.ptp(np.stack(_finite_bounds(points))[:, :2], axis=0).min())
 
 
 def _edge(mesh: Mesh) -> float | None:
