@@ -775,6 +775,29 @@ def test_apply_moves_a_further_file(
     np.testing.assert_allclose(moved[:, :3], transform.apply(points), atol=2e-3)
 
 
+def test_apply_refuses_before_the_work_what_cannot_be_written(
+    tmp_path: Path, pair: tuple[str, str], run: Run, verdict: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import meshreg.io
+    from meshreg.errors import InputError
+
+    verdict("accepted")
+    out = tmp_path / "out"
+    assert run("register", *pair, "-o", out)[0] == 0
+    written: list[Any] = []
+
+    def bent(survey: Any, reference: Any = None) -> None:
+        raise InputError("would be bent by that.", file=survey.source[0].path)
+
+    monkeypatch.setattr(meshreg.io, "require_writable", bent)
+    monkeypatch.setattr(meshreg.io, "rewrite_survey", lambda *given, **more: written.append(given))
+    code, _, error = run("apply", out, pair[1], "-o", tmp_path / "moved")
+    assert code == 3
+    assert "would be bent" in error
+    assert not written
+    assert not (tmp_path / "moved").exists()
+
+
 def test_apply_writes_in_the_reference_files_axes(
     tmp_path: Path, pair: tuple[str, str], run: Run, verdict: Any
 ) -> None:

@@ -477,6 +477,27 @@ def test_damaged_evidence_is_refused_and_the_page_stays(
     assert path.read_bytes() == before
 
 
+@pytest.mark.parametrize("state", ["as written", "changed", "no manifest"])
+def test_only_a_changed_result_is_blamed_for_a_page_that_fails(
+    results: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, state: str
+) -> None:
+    import meshreg.report
+    from meshreg.io.manifest import write_manifest
+
+    folder = shutil.copytree(results["accepted"], tmp_path / "r")
+    if state != "no manifest":
+        write_manifest(folder, "register")
+    if state == "changed":
+        record = folder / "registration.json"
+        record.write_text(record.read_text() + "\n")
+
+    def broken(result: Any) -> str:
+        raise KeyError("ours")
+
+    monkeypatch.setattr(meshreg.report, "report_page", broken)
+    assert cli.run(["report", str(folder)]) == (1 if state == "as written" else 3)
+
+
 def test_a_folder_without_a_result_is_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -41,7 +41,7 @@ class ApplyRequest:
 
 def apply(request: ApplyRequest, voice: Voice, unfinished: Unfinished) -> dict[str, Any]:
     """Move a further file of the moving survey by a registration that was found."""
-    from meshreg.io import rewrite_survey, unchanged
+    from meshreg.io import require_warpable, require_writable, rewrite_survey, unchanged
     from meshreg.io.atomic import as_output_error
     from meshreg.io.manifest import require_apart, survey_files
     from meshreg.io.record import read_registration, reference_stand_in, to_json
@@ -64,9 +64,12 @@ def apply(request: ApplyRequest, voice: Voice, unfinished: Unfinished) -> dict[s
         require_apart(request.out, survey_files(survey))
         if registration.verdict == "review":
             notes.append("The registration is in review: this is its best hypothesis only.")
+        stand_in = reference_stand_in(registration)
+        require_writable(survey, stand_in)
+        if registration.warp is not None:
+            require_warpable(survey)
         require_disk(folder, survey)
         progress("write", 0.0)
-        stand_in = reference_stand_in(registration)
         warp = registration.warp
         files = rewrite_survey(survey, registration.transform, folder, stand_in, warp=warp)
         unchanged(survey)

@@ -122,6 +122,20 @@ def require_ours(folder: Path, names: Sequence[str]) -> None:
             )
 
 
+def are_as_written(folder: Path, names: Sequence[str]) -> bool:
+    """Whether the manifest of `folder` knows each of `names` as it is, byte for byte.
+
+    Raises
+    ------
+    UsageError
+        The manifest is damaged.
+    """
+    if not (folder / NAME).is_file():
+        return False
+    known = _document(folder)["files"]
+    return all(_is_as_written(folder / name, known.get(name)) for name in names)
+
+
 def require_only_ours(folder: Path, markers: Sequence[str], seen: Seen | None = None) -> Seen:
     """Refuse a folder that may not be replaced as a whole.
 

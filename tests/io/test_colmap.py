@@ -233,6 +233,18 @@ def test_exact_positions_give_the_truth(tmp_path, scene):
     np.testing.assert_allclose(frame.axes, UNIT * TURN, atol=1e-9)
 
 
+@pytest.mark.parametrize("far", [1e303, -1e200, 1e13, np.nan])
+def test_points_beyond_measure_are_left_out(tmp_path, scene, far):
+    folder = write_bin(tmp_path / "reef", scene)
+    data = bytearray((folder / "points3D.bin").read_bytes())
+    struct.pack_into("<d", data, 16, far)  # x of the first point, after two counters of 8 bytes
+    (folder / "points3D.bin").write_bytes(data)
+    table = write_table(tmp_path / "nav.csv", scene, scene.cameras)
+    survey = colmap.read(folder, ReadOptions(positions=table, crs=None))
+    np.testing.assert_allclose(absolute(survey), scene.world[1:], atol=1e-8)
+    assert any(f"1 of {len(scene.world)} points" in note for note in survey.notes)
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_noisy_positions_with_blunders(tmp_path, seed):
     """Errors are about the noise put in: not more, and the stated sigma neither more nor less."""

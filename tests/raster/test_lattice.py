@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from reference_raster import block_mean, draped, moved, sheet
 
 from meshreg.errors import InputError, ResourceLimitError, UsageError
+from meshreg.raster import rasterize
 from meshreg.raster.grid import (
     cell_offset,
     check_size,
@@ -19,6 +20,7 @@ from meshreg.raster.grid import (
     coarsened,
     common_grid,
     measure_spacing,
+    require_together,
     survey_bounds,
     survey_grid,
 )
@@ -387,3 +389,67 @@ def test_scattered_points_keep_three_spacings():
     scattered = cloud(1.0, size=100, seed=3)
     assert not measure_spacing(scattered).gridded
     assert choose_cells(scattered, scattered).dem == 3.0
+
+
+# -- points far away --------------------------------------------------------------------------------
+
+
+def scattered(where, size=10.0, *, mesh=False, far=()):
+    """3,000 points (or 1,000 triangles of them) on a plot; those in `far` are put elsewhere."""
+    points = np.random.default_rng(5).uniform(0, size, (3000, 3))
+    for row, place in far:
+        points[row] = place
+    faces = np.arange(3000, dtype=np.int32).reshape(-1, 3)
+    geometry = Mesh(points, faces) if mesh else PointCloud(points)
+    return Survey("plot", geometry, origin=where)
+
+
+@pytest.mark.parametrize("mesh", [False, True])
+@pytest.mark.parametrize(
+    "place", [(1e6, 3.0, 0.0), (3.0, -1e6, 0.0), (1e6, 1e6, 0.0), (1e11, 0, 0)]
+)
+def test_a_point_far_from_all_others_is_named(mesh, place):
+    where = np.array([500_000.0, 6_000_000.0, 0.0])
+    survey = scattered(where, mesh=mesh, far=[(7, place)])
+    east, north = place[0] + where[0], place[1] + where[1]
+    with pytest.raises(InputError, match="1 of 3,000 points far away") as caught:
+        rasterize(survey, settings=RasterSettings(dem_cell=0.5, ortho_cell=0.5))
+    assert f"{east:.10g} m east, {north:.10g} m north" in str(caught.value)
+
+
+@pytest.mark.parametrize(("cells", "refused"), [(63, False), (65, True)])
+def test_64_blocks_for_the_sake_of_one_point(cells, refused):
+    reach = (cells - 0.5) * 512 * 0.5
+    survey = scattered(np.zeros(3), far=[(7, (reach, 5.0, 0.0))])
+    if refused:
+        with pytest.raises(InputError, match="far away"):
+            require_together(survey, 0.5)
+    else:
+        require_together(survey, 0.5)
+
+
+def test_a_long_strip_two_sites_and_large_triangles_are_no_outliers():
+    strip = scattered(np.zeros(3))
+    points = strip.geometry.points * [5000.0, 1.0, 1.0]  # 50 km x 10 m
+    require_together(Survey("strip", PointCloud(points)), 0.1)
+    two = strip.geometry.points + np.where(np.arange(3000)[:, None] % 20 == 0, 5e4, 0.0)
+    require_together(Survey("two", PointCloud(two)), 0.1)
+    corners = np.array([[0, 0, 0], [3e4, 0, 0], [0, 3e4, 0], [3e4, 3e4, 0]], float)
+    faces = np.array([[0, 1, 2], [1, 3, 2]], np.int32)
+    require_together(Survey("sheet", Mesh(corners, faces)), 0.5)
+
+
+@pytest.mark.parametrize("mesh", [False, True])
+@pytest.mark.parametrize("size", [1e-320, 1e-200, 1e-150, 1e-12])
+def test_a_plot_of_no_size_is_no_ground(mesh, size):
+    with pytest.raises(InputError, match="covers no ground"):
+        choose_cells(*2 * [scattered(np.zeros(3), size, mesh=mesh)])
+
+
+def test_a_wall_that_faces_north_is_no_ground():
+    survey = scattered(np.zeros(3), mesh=True)
+    points = survey.geometry.vertices.copy()
+    points[:, 1] = 5.0
+    wall = Survey("wall", Mesh(points, survey.geometry.faces))
+    with pytest.raises(InputError, match="covers no ground"):
+        choose_cells(wall, wall)
