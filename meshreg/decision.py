@@ -157,6 +157,10 @@ def decide(
         known = delivered.judgement.verdict != "rejected"
         better = decision.judgement.false_alarm < delivered.judgement.false_alarm
         return decision if better or not known else delivered
+    if decision.found.turned and decision.judgement.verdict != "accepted":
+        # the finer tiles contradict the turn: few of the coarse ones told it
+        delivered = _in_frame(pairs, settings, radius, clock, manual, None)
+        return delivered if delivered.judgement.verdict == "accepted" else decision
     if decision.judgement.verdict != "rejected":
         return decision
     return _in_frame(pairs, settings, radius, clock, manual, turn)

@@ -23,6 +23,9 @@ from meshreg.types import Bool, Float64, Grid, OffsetAt, SurveyRaster
 
 MAX_YAW = np.deg2rad(1.0)
 HIGH_PASS = 2.0  # cells: finer than any warp, coarser than the noise of single cells
+# The fields are two of tones and two of edges, and what all lean to none of them shows: two
+# sigmas of what they differ by (the variance of two about their mean, doubled for its own doubt).
+ALIKE = 2.0
 STACKED = 64  # tiles whose evidence is added, at most
 # Cells about a tile's own offset: what a field would have instead of it lies within the fields'
 # own width (`neutral.fields`: six cells, to either side); beyond it is chance.
@@ -261,7 +264,7 @@ def spread_of_fields(
             apart = np.array([place[0] - answer.east, place[1] - answer.north])
             chance = np.exp(-0.5 * max(total[home] - total[at], 0.0) ** 2)
             spread += chance / (1 + chance) * np.outer(apart, apart)
-    return np.asarray(spread)
+    return np.asarray(ALIKE**2 * spread)
 
 
 def _in_deviations_of(stack: Float64, ring: Bool) -> Float64:

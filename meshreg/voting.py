@@ -143,9 +143,7 @@ def vote(pairs: Mapping[str, Pair], settings: SearchSettings, radius: float) -> 
         if turn is None:
             continue
         trials += turn.trials
-        inside = abs(turn.yaw) <= max_yaw + SMALL_YAW
-        inside = inside and abs(turn.stretch - 1) <= max_scale + PLAIN_SCALE
-        if inside and (best is None or turn.gap > best.gap):
+        if _inside(turn, settings) and (best is None or turn.gap > best.gap):
             best = turn
         if best is not None and best.proven:
             break
@@ -156,8 +154,15 @@ def vote(pairs: Mapping[str, Pair], settings: SearchSettings, radius: float) -> 
     best = replace(best, trials=trials, centre=centre, offset=offset)
     pairs = delivered
     if abs(best.yaw) <= SMALL_YAW and abs(best.stretch - 1) >= FINE_SCALE:
-        best = settled(pairs, best, best.offset_at)
+        finer = settled(pairs, best, best.offset_at)
+        best = finer if _inside(finer, settings) else best
     return scaled(best, settings)
+
+
+def _inside(turn: Turn, settings: SearchSettings) -> bool:
+    """Whether a turn is one of those that were asked for."""
+    most = np.deg2rad(settings.max_yaw) + SMALL_YAW, settings.max_scale + PLAIN_SCALE
+    return bool(abs(turn.yaw) <= most[0] and abs(turn.stretch - 1) <= most[1])
 
 
 def _laid_together(

@@ -391,7 +391,7 @@ def test_scattered_points_keep_three_spacings():
     assert choose_cells(scattered, scattered).dem == 3.0
 
 
-# -- points far away --------------------------------------------------------------------------------
+# -- points far away ------------------------------------------------------------------------------
 
 
 def scattered(where, size=10.0, *, mesh=False, far=()):
