@@ -17,7 +17,7 @@ from meshreg.errors import UsageError
 from meshreg.settings import Settings
 
 LARGEST = 1e9  # of any number of a recipe
-_RANGES = {
+RANGES = {
     "output.size": (1.0, 1000.0),
     "output.texture": (0.001, 1.0),
     "output.pages": (1, 64),
@@ -198,7 +198,7 @@ def _set(record: Any, key: str, parts: list[str], value: Any, path: Path) -> Any
 
 def _fitted(now: Any, value: Any, drawn: bool, key: str, path: Path) -> Any:
     """Return `value` in the type of `now` (a range too where `drawn`), or say what was expected."""
-    low, high = _RANGES.get(key, (-LARGEST, LARGEST))
+    low, high = RANGES.get(key, (-LARGEST, LARGEST))
     for item in value if isinstance(value, list | tuple) else (value,):
         if isinstance(item, int | float) and not low <= item <= high:  # NaN too
             raise UsageError(

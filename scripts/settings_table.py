@@ -10,6 +10,7 @@ from typing import Any
 ROOT = Path(__file__).parent.parent
 sys.path.insert(0, str(ROOT))
 
+from data_synth.recipe import LARGEST, RANGES, Recipe  # noqa: E402
 from meshreg.checked import Limits, wanted  # noqa: E402
 from meshreg.settings import Settings  # noqa: E402
 
@@ -24,10 +25,32 @@ no numbers here. The defaults are those of `--preset robust`.
 
 """
 
+_RECIPES = f"""
+## Recipes
+
+`meshreg synth` takes a recipe's keys by `--set` or from a TOML file. `severity` is a number from 0
+to 1, `settings.…` are as above, and a number that is not listed here is one from -{LARGEST:g}
+to {LARGEST:g}, of the kind that the scenarios show.
+
+"""
+
 
 def page() -> str:
     """Return the text of docs/settings.md."""
-    return _HEAD + _table(_rows(Settings()))
+    return _HEAD + _table(_rows(Settings())) + _recipes()
+
+
+def _recipes() -> str:
+    """Return the ranges of the recipes of `meshreg synth`."""
+    lines = ["| key | default | may be |", "|---|---|---|"]
+    for key, (low, high) in RANGES.items():
+        section, name = key.split(".")
+        default = getattr(getattr(Recipe(), section), name)
+        whole = "a whole number" if isinstance(default, int) else "a number"
+        if isinstance(default, tuple):
+            whole = "a number, or a list of two between which it is drawn,"
+        lines.append(f"| `{key}` | {default} | {whole} from {low:g} to {high:g} |")
+    return _RECIPES + "\n".join(lines) + "\n"
 
 
 def _table(rows: list[tuple[str, ...]]) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import os
+import re
 import runpy
 from collections.abc import Iterator
 from pathlib import Path
@@ -201,3 +202,15 @@ def test_the_table_in_the_docs_is_current():
     for key, kind, limits in every_setting():
         assert f"| `{key}` |" in page
         assert wanted(kind, limits) in page
+
+
+def test_a_recipe_takes_what_the_table_says_and_nothing_beyond():
+    from data_synth.recipe import RANGES, load
+
+    page = (ROOT / "docs" / "settings.md").read_text(encoding="utf-8")
+    for key, (low, high) in RANGES.items():
+        assert f"| `{key}` |" in page
+        for end, step in ((low, -1), (high, 1)):
+            load("flat_sand", {key: end})
+            with pytest.raises(UsageError, match=re.escape(f"from {low:g} to {high:g}")):
+                load("flat_sand", {key: end + step * max(1.0, 1e-3 * abs(end))})
