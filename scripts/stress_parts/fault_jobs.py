@@ -152,7 +152,6 @@ JOBS = (
         "selftest",
         ("selftest", *PAIR, "-o", "{1}/out", "--shifts", "1", "--set", f"search.radius={RADIUS}"),
     ),
-    Job("synth", ("synth", "flat_sand", "-o", "{1}/out", "--size", "2")),
     Job("report", ("report", "{1}/out"), before=registered),
     Job("validate", ("validate", "{1}/out", "{0}/ties.csv"), before=registered),
 )
