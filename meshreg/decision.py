@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -25,21 +25,25 @@ from meshreg.heading import (
 from meshreg.heights import Heights, fit_heights
 from meshreg.held_out import RAYLEIGH
 from meshreg.kriging import Ground
+from meshreg.narrowing import NOWHERE, Elsewhere, cut, elsewhere, margin, narrowing, places
 from meshreg.offsets import ESTIMATORS, estimate_offset, neutral
+from meshreg.offsets.correlate import Window
 from meshreg.offsets.neutral import FieldsOf, pair_fields
 from meshreg.refine import PEAK_RESOLUTION, Refined, dem_ground, refine, with_scale
 from meshreg.settings import Settings
 from meshreg.tears import Tear, tear_of_tiles
+from meshreg.tile_surfaces import near_offset
 from meshreg.tiles import correlated_tiles
 from meshreg.types import (
     Float64,
+    Grid,
     OffsetEstimate,
     Survey,
     SurveyRaster,
     Transform,
 )
 from meshreg.verdict import Found, Stretch, findings, last_word
-from meshreg.voting import Turn, vote
+from meshreg.voting import STANDS_OUT, Turn, vote
 
 log = logging.getLogger(__name__)
 Progress = Callable[[str, float], None]
@@ -138,32 +142,111 @@ def decide(
         motion; without it a survey that needs turning is looked at as it is.
     """
     clock = Clock(progress or (lambda stage, fraction: None))
+    times = _narrowing(pairs, radius)
+    if times > 1:
+        return _narrowed(pairs, settings, radius, clock, manual, turned, times)
+    return _asked(pairs, settings, radius, clock, manual, turned)
+
+
+def _asked(
+    pairs: Pairs,
+    settings: Settings,
+    radius: float,
+    clock: Clock,
+    manual: Manual | None,
+    turned: Turned | None,
+    beyond: Elsewhere = NOWHERE,
+) -> Decision:
+    """Turn the moving survey if its tiles ask for it; then estimate, judge and refine."""
     turn = None
     if settings.search.max_yaw > 0 or settings.search.max_scale > 0:
         with clock.stage("vote"):
             turn = vote(pairs, settings.search, radius)
+    in_frame = partial(_in_frame, beyond=beyond)
     if turn is None or not turn.needed or turned is None:
-        return _in_frame(pairs, settings, radius, clock, manual, turn)
+        return in_frame(pairs, settings, radius, clock, manual, turn)
     log.info("the tiles vote for a turn: %s", turn)
     delivered = None
     if not turn.proven:  # what the tiles do not prove the judge may, who is told of all trials
-        delivered = _in_frame(pairs, settings, radius, clock, manual, None)
+        delivered = in_frame(pairs, settings, radius, clock, manual, None)
         if delivered.judgement.verdict == "accepted":
             return delivered
     with clock.stage("turn"):
         again, motion = turned_as_voted(pairs, turn, turned, settings.search)
-    decision = _in_frame(again, settings, radius, clock, manual, turn, (motion, pairs))
+    decision = in_frame(again, settings, radius, clock, manual, turn, (motion, pairs))
     if delivered is not None:
         known = delivered.judgement.verdict != "rejected"
         better = decision.judgement.false_alarm < delivered.judgement.false_alarm
         return decision if better or not known else delivered
     if decision.found.turned and decision.judgement.verdict != "accepted":
         # the finer tiles contradict the turn: few of the coarse ones told it
-        delivered = _in_frame(pairs, settings, radius, clock, manual, None)
+        delivered = in_frame(pairs, settings, radius, clock, manual, None)
         return delivered if delivered.judgement.verdict == "accepted" else decision
     if decision.judgement.verdict != "rejected":
         return decision
-    return _in_frame(pairs, settings, radius, clock, manual, turn)
+    return in_frame(pairs, settings, radius, clock, manual, turn)
+
+
+def _narrowing(pairs: Pairs, radius: float) -> int:
+    return narrowing(_grids(pairs["dem"]), _grids(pairs["ortho"]), radius)
+
+
+def _narrowed(
+    pairs: Pairs,
+    settings: Settings,
+    radius: float,
+    clock: Clock,
+    manual: Manual | None,
+    turned: Turned | None,
+    times: int,
+) -> Decision:
+    """Look for places on coarse cells; decide at the one that is best on the pair's own."""
+    search = settings.search
+    about = margin(*(raster.grid for raster in pairs["dem"]))
+    with clock.stage("coarse"):
+        found = places(pairs, search, radius, times)
+        picked = None if manual is None else manual(None)
+        if picked is not None and picked.status != "failed":
+            found = [(picked.east, picked.north), *found]
+        cuts = [cut(pairs, place, about) for place in found]
+        cuts = [part for part in cuts if not Window.around(*_grids(part["dem"]), radius).empty]
+        if not cuts:  # nothing overlaps: it is told as ever
+            cuts = [cut(pairs, (0.0, 0.0), about)]
+        maps = [judging.channel_maps(part, radius, chance=False) for part in cuts]
+        clear = [
+            max((m.peak.gap for m in seen.values() if m.peak is not None), default=0.0)
+            for seen in maps
+        ]
+        best = int(np.argmax(clear))
+        if clear[best] < settings.judge.overwhelming_gap and turned is not None:
+            turns = [vote(part, search, radius) for part in cuts]
+            gaps = [0.0 if turn is None or not turn.needed else turn.gap for turn in turns]
+            if max(gaps) >= STANDS_OUT or clear[best] < settings.judge.accept_gap:
+                best = int(np.argmax(gaps)) if max(gaps) > 0 else best
+        whole = Window.around(*_grids(pairs["dem"]), radius)
+        beyond = elsewhere(maps[best], [m for k, m in enumerate(maps) if k != best], whole)
+
+    def turned_and_cut(turn: Turn) -> tuple[Pairs, Transform]:
+        assert turned is not None
+        again, motion = turned(turn)
+        kept = cuts[best]
+        return {
+            name: (kept[name][0], near_offset(moving, kept[name][0], (0.0, 0.0), radius))
+            for name, (_, moving) in again.items()
+        }, motion
+
+    again = None if turned is None else turned_and_cut
+    decision = _asked(cuts[best], settings, radius, clock, manual, again, beyond)
+    cell = times * pairs["dem"][0].grid.cell
+    note = (
+        f"every offset within ±{radius:g} m was looked at in cells of {cell:.3g} m first, the "
+        f"{len(cuts)} best places then in cells of {pairs['dem'][0].grid.cell:g} m"
+    )
+    return dataclasses.replace(decision, notes=(*decision.notes, note))
+
+
+def _grids(pair: tuple[SurveyRaster, SurveyRaster]) -> tuple[Grid, Grid]:
+    return pair[0].grid, pair[1].grid
 
 
 def _in_frame(
@@ -174,6 +257,7 @@ def _in_frame(
     manual: Manual | None,
     turn: Turn | None,
     delivered: tuple[Transform, Pairs] | None = None,
+    beyond: Elsewhere = NOWHERE,
 ) -> Decision:
     """Estimate, judge and refine on rasters; of the turned survey, where `delivered` is given."""
     motion, first = (None, pairs) if delivered is None else delivered
@@ -191,7 +275,8 @@ def _in_frame(
             estimates.append(_within(radius, manual(motion)))
         with clock.stage("judge"):
             trials = 1 if turn is None or motion is None else turn.trials
-            judgement = judging.judge(estimates, pairs, settings, radius, trials, maps.result())
+            seen = (trials * beyond.times, maps.result(), beyond.values)
+            judgement = judging.judge(estimates, pairs, settings, radius, *seen)
     refined, heights = None, None
     notes: tuple[str, ...] = ()
     placed, found = judgement, Found()

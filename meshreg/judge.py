@@ -121,6 +121,8 @@ def channel_maps(
     rasters: Mapping[str, tuple[SurveyRaster, SurveyRaster]],
     radius: float,
     fields: neutral.FieldsOf = neutral.pair_fields,
+    *,
+    chance: bool = True,
 ) -> dict[str, ChannelMap]:
     """Compute the evidence of each channel, "terrain" and "image", that has any.
 
@@ -132,10 +134,13 @@ def channel_maps(
         Half width of the search window [m].
     fields : callable, optional
         Instead of `neutral.pair_fields`, where their fields are known already.
+    chance : bool
+        False: what chance does is not measured, which takes ten times as long.
     """
     maps: dict[str, ChannelMap] = {}
     for channel, raster in (("terrain", "dem"), ("image", "ortho")):
-        found = channel_map(*rasters[raster], channel, radius, SCORED_OVERLAP, fields)  # type: ignore[arg-type]
+        pair = rasters[raster]
+        found = channel_map(*pair, channel, radius, SCORED_OVERLAP, fields, chance=chance)  # type: ignore[arg-type]
         if found is not None:
             maps[channel] = found
     return maps
@@ -148,6 +153,7 @@ def judge(
     radius: float,
     trials: int = 1,
     maps: Mapping[str, ChannelMap] | None = None,
+    rivals: Mapping[str, float] | None = None,
 ) -> Judgement:
     """Weigh the methods' candidates against the evidence of terrain and image.
 
@@ -164,6 +170,8 @@ def judge(
         so many times more likely.
     maps : mapping, optional
         The `channel_maps` of these rasters, where they have been computed already.
+    rivals : mapping, optional
+        The highest evidence of each channel at places that these rasters do not show.
     """
     if maps is None:
         maps = channel_maps(rasters, radius)
@@ -171,7 +179,9 @@ def judge(
         return Judgement("rejected", "the surveys do not overlap within the search window", None)
     reach = agree_distance(settings.judge, rasters["dem"][0].grid.cell)
     candidates = _candidates(estimates, maps)
-    hypotheses = tuple(sorted(_merge(candidates, maps, reach), key=lambda h: h.score, reverse=True))
+    hypotheses = tuple(
+        sorted(_merge(candidates, maps, reach, rivals or {}), key=lambda h: h.score, reverse=True)
+    )
     if not hypotheses:
         return Judgement("rejected", "no method found a candidate", None, maps=maps)
     reliefs = [relief_of(raster) for raster in rasters["dem"]]
@@ -216,6 +226,8 @@ def channel_map(
     radius: float,
     min_overlap: float,
     fields: neutral.FieldsOf = neutral.pair_fields,
+    *,
+    chance: bool = True,
 ) -> ChannelMap | None:
     """Compute a channel's evidence and its null; None where there is nothing to compare."""
     valid = (
@@ -255,12 +267,12 @@ def channel_map(
     if peak is None:
         return None
     turned: dict[str, float] = {}
-    for turn, flip in TURNS:
+    for turn, flip in TURNS if chance else ():
         null = look(second.turned(turn, flip), turn)
         if null is not None and null[3] is not None:
             turned[TURN_NAMES[turn, flip]] = null[3].gap
     exchanged: list[float] = []
-    for down, across in EXCHANGES:
+    for down, across in EXCHANGES if chance else ():
         other, steps = second.exchanged(down, across)
         # what was moved down and right matches the reference that much further up and left
         true = [
@@ -300,6 +312,7 @@ def _merge(
     candidates: list[tuple[float, float, Float64 | None, str]],
     maps: Mapping[str, ChannelMap],
     reach: float,
+    rivals: Mapping[str, float],
 ) -> list[Hypothesis]:
     """Score each candidate, then let those within `reach` of a better one join it."""
     scored = []
@@ -310,6 +323,8 @@ def _merge(
             gaps[name], values[name], place = gap_at(
                 channel.surface, window.east, window.north, (east, north), reach
             )
+            if name in rivals:  # evidence and gaps are in deviations of chance both
+                gaps[name] = min(gaps[name], values[name] - rivals[name])
             places.append(place)
         overlap = max(_overlap_at(channel, (east, north)) for channel in maps.values())
         scored.append(Hypothesis(east, north, np.eye(2), gaps, values, (method,), overlap))

@@ -149,21 +149,36 @@ def _some(corners: list[tuple[int, int]], mask: Bool, side: int) -> list[tuple[i
     return full[:: max(1, -(-len(full) // MOST))]
 
 
-def _near(raster: SurveyRaster, other: SurveyRaster, half: float) -> SurveyRaster:
-    """Cut off what lies further than `half` metres from the other raster."""
+def near_offset(
+    raster: SurveyRaster, other: SurveyRaster, offset: tuple[float, float], half: float
+) -> SurveyRaster:
+    """Cut off what lies further than `half` m from the other raster, which is moved by `offset`."""
     grid, (west, south, east, north) = raster.grid, other.grid.bounds
+    west, east = west + offset[0], east + offset[0]
+    south, north = south + offset[1], north + offset[1]
     rows, cols = grid.shape
     top = int(np.clip((grid.north - north - half) / grid.cell, 0, rows - 1))
     bottom = int(np.clip(math.ceil((grid.north - south + half) / grid.cell), top + 1, rows))
     left = int(np.clip((west - half - grid.west) / grid.cell, 0, cols - 1))
     right = int(np.clip(math.ceil((east + half - grid.west) / grid.cell), left + 1, cols))
-    if (bottom - top, right - left) == grid.shape:
+    return part_of(raster, slice(top, bottom), slice(left, right))
+
+
+def _near(raster: SurveyRaster, other: SurveyRaster, half: float) -> SurveyRaster:
+    """Cut off what lies further than `half` metres from the other raster."""
+    return near_offset(raster, other, (0.0, 0.0), half)
+
+
+def part_of(raster: SurveyRaster, rows: slice, cols: slice) -> SurveyRaster:
+    """Return those rows and columns of a raster, as views."""
+    grid, part = raster.grid, (rows, cols)
+    shape = rows.stop - rows.start, cols.stop - cols.start
+    if shape == grid.shape:
         return raster
-    part = (slice(top, bottom), slice(left, right))
-    corner = grid.west + left * grid.cell, grid.north - top * grid.cell
+    corner = grid.west + cols.start * grid.cell, grid.north - rows.start * grid.cell
     return dataclasses.replace(
         raster,
-        grid=Grid(*corner, grid.cell, (bottom - top, right - left), grid.crs),
+        grid=Grid(*corner, grid.cell, shape, grid.crs),
         height=raster.height[part],
         color=raster.color[part],
         valid=raster.valid[part],

@@ -165,6 +165,20 @@ def _inside(turn: Turn, settings: SearchSettings) -> bool:
     return bool(abs(turn.yaw) <= most[0] and abs(turn.stretch - 1) <= most[1])
 
 
+def coarse_turn(
+    pairs: Mapping[str, Pair], cell: float, settings: SearchSettings, radius: float
+) -> Turn | None:
+    """Return what the tiles vote for on cells of one size [m], without asking what it is worth."""
+    max_yaw, max_scale = float(np.deg2rad(settings.max_yaw)), settings.max_scale
+    if max_yaw <= 0 and max_scale <= 0:
+        return None
+    pairs, moved, radius = _laid_together(pairs, radius)
+    turn = _best_at(pairs, cell, radius, max_yaw, max_scale)
+    if turn is None:
+        return None
+    return replace(turn, offset=(turn.offset[0] + moved[0], turn.offset[1] + moved[1]))
+
+
 def _laid_together(
     pairs: Mapping[str, Pair], radius: float
 ) -> tuple[Mapping[str, Pair], tuple[float, float], float]:

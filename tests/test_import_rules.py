@@ -52,9 +52,10 @@ RULES: dict[str, set[str]] = {
     "verdict": BASE | {"gain", "judge", "tears"},
     "judge": BASE | {"raster", "offsets"},
     "levels": BASE | {"offsets", "raster", "statistics"},
+    "narrowing": BASE | {"judge", "offsets", "raster", "tile_surfaces", "voting"},
     "decision": BASE
-    | {"heading", "heights", "held_out", "judge", "kriging", "offsets", "refine", "statistics"}
-    | {"tears", "tiles", "verdict", "voting"},
+    | {"heading", "heights", "held_out", "judge", "kriging", "narrowing", "offsets", "refine"}
+    | {"statistics", "tears", "tile_surfaces", "tiles", "verdict", "voting"},
     "pipeline": BASE
     | {"decision", "gain", "heading", "heights", "judge", "layers", "levels", "offsets", "posture"}
     | {"raster", "refine", "statistics", "surfaces", "voting", "verdict", "warp", "warp_rasters"},

@@ -20,6 +20,7 @@ from meshreg.errors import MeshregError
 STAGES = {
     "read": "reading",
     "rasterize": "rasterizing",
+    "coarse": "searching in coarse cells",
     "sift": "matching image features",
     "terrain": "scanning the terrain",
     "mutual_information": "scanning for mutual information",
