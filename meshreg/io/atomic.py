@@ -150,7 +150,7 @@ def atomic_folder(
     OutputError
         Another run is writing there, or any OSError.
     """
-    from meshreg.io.manifest import discard, write_manifest
+    from meshreg.io.manifest import write_manifest
 
     path = Path(os.path.abspath(path))
     with as_output_error(path):
@@ -158,9 +158,9 @@ def atomic_folder(
     prefix = f".{short_name(path.name)}.{hashlib.sha256(os.fsencode(path.name)).hexdigest()[:8]}"
     with as_output_error(path), _locked(path, path.with_name(prefix + ".lock")):
         _clear_leftovers(path, prefix)
-        temporary = path.with_name(prefix + ".tmp")
+        temporary, old = path.with_name(prefix + ".tmp"), path.with_name(prefix + ".old")
         temporary.mkdir()
-        replaced = None
+        made = os.lstat(temporary)
         try:
             yield temporary
             if command:
@@ -169,12 +169,26 @@ def atomic_folder(
                 for name in names:
                     _sync(Path(folder, name))
             _require_replaceable(path, overwrite, markers, seen)
-            replaced = _swap_in(temporary, path, path.with_name(prefix + ".old"))
-        finally:
-            if replaced is None:
+            _swap_in(temporary, path, old)
+        finally:  # a signal may come at any line: what lies where is looked up, not remembered
+            if temporary.exists() and os.path.samestat(os.lstat(temporary), made):
+                if old.exists() and not path.exists():
+                    os.replace(old, path)
                 shutil.rmtree(temporary, ignore_errors=True)
-        if replaced.exists():
-            discard(replaced, path.with_name(path.name + ".kept"))
+            for former in (temporary, old):
+                if former.exists():
+                    _discarded(former, path.with_name(path.name + ".kept"))
+
+
+def _discarded(former: Path, kept: Path) -> None:
+    """Remove a former result; once more if a signal comes meanwhile."""
+    from meshreg.io.manifest import discard
+
+    try:
+        discard(former, kept)
+    except BaseException:
+        discard(former, kept)
+        raise
 
 
 def _require_replaceable(
@@ -266,27 +280,22 @@ def _clear_leftovers(path: Path, prefix: str) -> None:
         shutil.rmtree(temporary)
 
 
-def _swap_in(temporary: Path, path: Path, old: Path) -> Path:
-    """Rename `temporary` to `path`; return where what was there is now, if anything was.
+def _swap_in(temporary: Path, path: Path, old: Path) -> None:
+    """Rename `temporary` to `path`; what was there is at `temporary` or `old` then.
 
     Where the file system can, the two change places in one step, so that `path` is never missing;
     elsewhere a folder that is there is put back if the second rename fails.
     """
     if not path.exists():
         os.replace(temporary, path)
-        replaced = temporary
-    elif _exchange(temporary, path):
-        replaced = temporary
-    else:
+    elif not _exchange(temporary, path):
         os.replace(path, old)
         try:
             os.replace(temporary, path)
         except BaseException:
             os.replace(old, path)
             raise
-        replaced = old
     _sync_folder(path.parent)
-    return replaced
 
 
 def _exchange(one: Path, other: Path) -> bool:

@@ -222,7 +222,8 @@ def discard(folder: Path, kept: Path) -> None:
     with contextlib.suppress(OSError, UsageError):
         ours = _Ours(folder, marker)
         names = [name for name in _walk(folder) if ours.holds(name)]
-        names.sort(key=lambda name: name == NAME)  # last, so that a second attempt knows them too
+        # last what tells which are ours, so that a second attempt knows them too
+        names.sort(key=lambda name: name in (NAME, marker))
         for name in names:
             with contextlib.suppress(OSError):
                 os.unlink(folder / name)

@@ -6,8 +6,11 @@ import errno
 import hashlib
 import json
 import os
+import sys
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
+from types import FrameType
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -417,3 +420,66 @@ def test_a_killed_run_that_had_changed_places_is_cleared_away(out: Path) -> None
     assert sorted(os.listdir(out.parent)) == ["OUT", "OUT.kept"]
     assert tree(out.parent / "OUT.kept") == {"mine.txt": b"mine"}
     assert manifest.NAME not in tree(out)
+
+
+class StopAt:
+    """A trace function that raises KeyboardInterrupt at the k-th line of the code that swaps."""
+
+    def __init__(self, at: int) -> None:
+        self.left = at
+
+    def __call__(self, frame: FrameType, event: str, arg: object) -> StopAt | None:
+        code = frame.f_code
+        if (
+            code.co_filename not in (atomic.__file__, manifest.__file__)
+            or code.co_name == "_locked"
+        ):
+            return None  # the lock ends with the process, which the test does not
+        if event == "line":
+            self.left -= 1
+            if self.left == 0:
+                sys.settrace(None)
+                raise KeyboardInterrupt
+        return self
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # files left open
+@pytest.mark.parametrize("exchange", [True, False])
+def test_a_signal_at_any_line_leaves_one_whole_result_and_every_file_that_is_not_ours(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, exchange: bool
+) -> None:
+    """Somebody puts a file into OUT at the last moment, after it was looked at for such."""
+    swap, before = atomic._swap_in, sys.gettrace()
+    if not exchange:
+        monkeypatch.setattr(atomic, "_exchange", lambda one, other: False)
+
+    def late(temporary: Path, path: Path, old: Path) -> None:
+        (path / "mine.txt").write_text("mine")
+        swap(temporary, path, old)
+
+    at, stopped = 0, True
+    while stopped:
+        at += 7  # of some 1,500
+        out = tmp_path / str(at) / "OUT"
+        out.parent.mkdir()
+        make(out)
+        with monkeypatch.context() as patch:
+            patch.setattr(atomic, "_swap_in", late)
+            try:
+                with atomic_folder(out, overwrite=True, command="register") as folder:
+                    (folder / "registration.json").write_text("2")
+                    sys.settrace(StopAt(at))
+                stopped = False
+            except KeyboardInterrupt:
+                pass
+            finally:
+                sys.settrace(before)
+        put = [path.read_text() for path in out.parent.rglob("mine.txt")]
+        with suppress(UsageError):  # where "mine.txt" is in OUT still
+            make(out, overwrite=True, text="3")
+        assert (out / "registration.json").read_text() in ("1", "3"), at
+        assert set(os.listdir(out.parent)) <= {"OUT", "OUT.kept"}, at
+        kept = [path.read_text() for path in out.parent.rglob("mine.txt")]
+        assert kept == put, at
+    assert put == ["mine"]
+    assert at > 100
