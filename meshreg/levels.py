@@ -45,6 +45,16 @@ def rasterize_pair(
     return {name: (still[name], moved[name]) for name in cells}
 
 
+def pair_grids(
+    reference: Survey, moving: Survey, settings: Settings
+) -> dict[str, tuple[Grid, Grid]]:
+    """Return the grids (reference, moving) on which `rasterize_pair` lays the surveys."""
+    cells = _cells(settings)
+    lattice = _lattice(cells)
+    still, moved = (survey_grids(survey, cells, lattice) for survey in (reference, moving))
+    return {name: (still[name], moved[name]) for name in cells}
+
+
 def lay_down(
     moving: Survey,
     transform: Transform | None,

@@ -24,11 +24,12 @@ from meshreg.gain import Gain
 from meshreg.heading import Pairs, turning
 from meshreg.heights import STABLE, Heights, stable_ground
 from meshreg.layers import second_surface
-from meshreg.levels import lay_down, rasterize_pair
+from meshreg.levels import lay_down, pair_grids, rasterize_pair
 from meshreg.offsets import ESTIMATORS, search_radius
 from meshreg.posture import axes_after, in_degrees, other_axes, posture
 from meshreg.raster.grid import choose_cells
 from meshreg.refine import Refined
+from meshreg.search_cost import require_search
 from meshreg.settings import Settings
 from meshreg.surfaces import Polished, check_surfaces, polish
 from meshreg.types import (
@@ -92,6 +93,8 @@ def register_pair(  # noqa: PLR0913
         If the surveys' CRS differ, or only one of them has a known scale.
     InputError
         If every file of both surveys is the same, and that is not allowed.
+    ResourceLimitError
+        If the search would take more memory than is free.
     """
     settings = settings or Settings()
     if not allow_same:
@@ -258,7 +261,7 @@ def _gain(gain: Gain | None) -> dict[str, Any] | None:
 def prepared(
     reference: Survey, moving: Survey, settings: Settings
 ) -> tuple[Settings, float, list[str]]:
-    """Check the call; return the settings with cells and radius filled in, the radius, notes."""
+    """Check the call and what it costs; return the settings with cells and radius, that, notes."""
     _check(reference, moving, settings)
     cells = choose_cells(reference, moving, settings.raster)
     radius = search_radius(settings, cells.dem)
@@ -270,6 +273,7 @@ def prepared(
             "raster.sift_cell": cells.sift,
         }
     )
+    require_search(pair_grids(reference, moving, settings), settings, radius)
     return settings, radius, list(cells.notes)
 
 

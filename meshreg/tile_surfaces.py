@@ -79,6 +79,16 @@ def channel_surfaces(
     return TileSurfaces(moving.grid.cell, reach, surfaces, scored, centres, np.zeros_like(centres))
 
 
+def surfaces_bytes(moving: SurveyRaster, cell: float, radius: float, turn: float) -> float:
+    """Reckon the bytes that both channels' surfaces take: each channel's, joined, and pooled."""
+    times = max(1, round(cell / moving.grid.cell))
+    arm = 0.5 * math.hypot(*moving.grid.shape) * moving.grid.cell
+    width = 2 * math.ceil((radius + arm * turn) / cell + 2) + 1
+    cells = int(moving.valid.sum()) / times**2
+    side = float(np.clip(math.sqrt(cells) / TILES, *TILE_CELLS))
+    return 2 * min(MOST, cells / side**2) * width**2 * (2 * 5 + 4)
+
+
 def surfaces_near(
     reference: SurveyRaster,
     moving: SurveyRaster,

@@ -28,6 +28,7 @@ from meshreg.tile_surfaces import (
     channel_surfaces,
     joined,
     pooled,
+    surfaces_bytes,
     surfaces_near,
 )
 from meshreg.types import Bool, Float32, Float64, OffsetAt, SurveyRaster
@@ -35,6 +36,7 @@ from meshreg.types import Bool, Float32, Float64, OffsetAt, SurveyRaster
 Pair = tuple[SurveyRaster, SurveyRaster]
 ACROSS = 100  # voting cells along the patch: enough for 25 tiles, few enough for a fraction of 1 s
 MIN_TILES = 4
+MOST_BYTES = 2e9  # of the tiles' surfaces
 PEAKS = 40  # places that are looked at again
 STANDS_OUT = 3.0  # deviations over the best unrelated hypothesis; chance reaches 2
 CHANCE = 5.0  # deviations: the best of some thousand unrelated hypotheses and offsets
@@ -138,7 +140,7 @@ def vote(pairs: Mapping[str, Pair], settings: SearchSettings, radius: float) -> 
     delivered = pairs
     pairs, moved, radius = _laid_together(pairs, radius)
     trials, best = 0, None
-    for cell in _voting_cells(pairs):
+    for cell in _voting_cells(pairs, radius, max_yaw + max_scale):
         turn = _best_at(pairs, cell, radius, max_yaw, max_scale)
         if turn is None:
             continue
@@ -266,18 +268,21 @@ def settled(pairs: Mapping[str, Pair], turn: Turn, guess: OffsetAt) -> Turn:
     return replace(turn, yaw=turn.yaw + fitted[0], stretch=stretch, ratio=ratio)
 
 
-def _voting_cells(pairs: Mapping[str, Pair]) -> list[float]:
+def _voting_cells(pairs: Mapping[str, Pair], radius: float, turn: float) -> list[float]:
     """Cells [m] to vote on, multiples of the DEM's.
 
     `ACROSS` of the first lie across the smaller survey; each other is half as large, down to the
-    DEM's own.
+    DEM's own, as long as the surfaces of all tiles stay within `MOST_BYTES`.
     """
     raster = min(pairs["dem"], key=lambda r: int(r.valid.sum()))
     times = max(1, round(math.sqrt(max(int(raster.valid.sum()), 1)) / ACROSS))
     cells = [times * raster.grid.cell]
     while times > 1:
         times = (times + 1) // 2
-        cells.append(times * raster.grid.cell)
+        cell = times * raster.grid.cell
+        if surfaces_bytes(pairs["dem"][1], cell, radius, turn) > MOST_BYTES:
+            break
+        cells.append(cell)
     return cells
 
 

@@ -53,12 +53,14 @@ RULES: dict[str, set[str]] = {
     "judge": BASE | {"raster", "offsets"},
     "levels": BASE | {"offsets", "raster", "statistics"},
     "narrowing": BASE | {"judge", "offsets", "raster", "tile_surfaces", "voting"},
+    "search_cost": BASE | {"io", "narrowing", "offsets"},
     "decision": BASE
     | {"heading", "heights", "held_out", "judge", "kriging", "narrowing", "offsets", "refine"}
     | {"statistics", "tears", "tile_surfaces", "tiles", "verdict", "voting"},
     "pipeline": BASE
     | {"decision", "gain", "heading", "heights", "judge", "layers", "levels", "offsets", "posture"}
-    | {"raster", "refine", "statistics", "surfaces", "voting", "verdict", "warp", "warp_rasters"},
+    | {"raster", "refine", "search_cost", "statistics", "surfaces", "voting", "verdict", "warp"}
+    | {"warp_rasters"},
     "ties": BASE | {"io", "raster", "offsets", "statistics", "report"},
     "doctor": set(),
 }
