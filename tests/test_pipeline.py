@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import re
 
 import numpy as np
 import pytest
@@ -258,3 +259,19 @@ def test_progress_names_each_stage_once_begun_and_once_done():
         assert fractions[0] == 0.0
         assert fractions[-1] == 1.0
         assert fractions == sorted(fractions)
+
+
+def test_the_radius_that_the_reason_names_gives_the_answer():
+    """A plot whose first place is 300 m off, end to end."""
+    first, later = floors()
+    reference = survey(first, half=4.0, step=0.05, seed=1)
+    away = np.array([300.0, -40.0, 0.0])
+    moving = survey(later, half=4.0, step=0.05, seed=2)
+    moving = dataclasses.replace(moving, origin=moving.origin + away)
+    refused = register_pair(reference, moving)
+    assert refused.verdict == "rejected"
+    radius = float(re.search(r"--search-radius ([\d.e+]+)", refused.reason)[1])
+    assert 300 < radius < 400
+    found = register_pair(reference, moving, Settings().changed({"search.radius": radius}))
+    assert found.verdict == "accepted", found.reason
+    np.testing.assert_allclose(found.transform.apply(away[None])[0], 0, atol=0.02)
