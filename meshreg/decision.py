@@ -31,7 +31,7 @@ from meshreg.offsets.correlate import Window
 from meshreg.offsets.neutral import FieldsOf, pair_fields
 from meshreg.refine import PEAK_RESOLUTION, Refined, dem_ground, refine, with_scale
 from meshreg.settings import Settings
-from meshreg.tears import Tear, tear_of_tiles
+from meshreg.tears import Tear, contradicts, tear_of_tiles
 from meshreg.tile_surfaces import near_offset
 from meshreg.tiles import correlated_tiles
 from meshreg.types import (
@@ -395,15 +395,21 @@ def _torn(
     fields: FieldsOf,
 ) -> Tear | None:
     """Find the largest tear that the tiles of a channel show, looked for further than a turn."""
-    tears = []
+    seen = []
     for reference, moving, channel in used:
         cell = moving.grid.cell
         reach = int(np.clip(np.ceil(TEAR_REACH / cell), *TEAR_CELLS))
         at = float(offset[0]), float(offset[1])
         tiles = correlated_tiles(reference, moving, channel, at, fields, reach)
-        found = None if tiles is None else tear_of_tiles(tiles, PEAK_RESOLUTION * cell)
-        if found is not None and found.size > TEAR_PART * cell:
-            tears.append(found)
+        if tiles is not None:
+            seen.append((tiles, cell, tear_of_tiles(tiles, PEAK_RESOLUTION * cell)))
+    tears = [
+        tear
+        for tiles, cell, tear in seen
+        if tear is not None
+        and tear.size > TEAR_PART * cell
+        and not any(contradicts(other, tear) for other, _, _ in seen if other is not tiles)
+    ]
     return max(tears, key=lambda tear: tear.size, default=None)
 
 

@@ -9,7 +9,7 @@ does not.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from meshreg.types import Bool, Float64
 
 LEAST_TILES = 16
 LEAST_SHARE = 0.12  # of the tiles: a smaller piece is ground that has changed
+LEAST_HELD = 3.0  # tiles: two or three that match wrongly may be alike by chance
 FALL = 0.5  # a jump must bring the squared error below this share of a smooth bend's
 SURE = 5.0  # sigmas
 TRIED = 8  # regions of those that explain most by least squares, that are fitted robustly
@@ -39,12 +40,15 @@ class Tear:
         Of the tiles that lie in the smaller part.
     side : str
         Where that part lies: "east", "north-east", ...
+    places : (M, 2) float64
+        Of the tiles of the smaller part: east and north [m].
     """
 
     apart: Float64
     sigma: float
     share: float
     side: str
+    places: Float64 = field(default_factory=lambda: np.zeros((0, 2)))
 
     @property
     def size(self) -> float:
@@ -55,6 +59,25 @@ class Tear:
 def tear_of_tiles(tiles: TileOffsets, resolution: float) -> Tear | None:
     """Find two populations of horizontal offsets; `resolution` [m] is what a tile is good for."""
     return find_tear(tiles.places, tiles.offsets, resolution)
+
+
+def contradicts(tiles: TileOffsets, tear: Tear) -> bool:
+    """Whether tiles of another channel see the torn part where the rest has it.
+
+    A model that is torn takes its relief and its picture along; what one of them shows alone is
+    ground that has changed.
+    """
+    from scipy.spatial import cKDTree
+
+    if not len(tear.places):
+        return False
+    side = np.sqrt(np.ptp(tiles.places, axis=0).prod() / len(tiles.places))
+    far, _ = cKDTree(tear.places).query(tiles.places)
+    inside = far <= 0.5 * side
+    if not LEAST_HELD <= inside.sum() < len(inside):
+        return False
+    apart = np.median(tiles.offsets[inside], axis=0) - np.median(tiles.offsets[~inside], axis=0)
+    return bool(np.linalg.norm(apart) < 0.5 * tear.size)
 
 
 def find_tear(places: Float64, values: Float64, resolution: float) -> Tear | None:
@@ -106,12 +129,12 @@ def find_tear(places: Float64, values: Float64, resolution: float) -> Tear | Non
     sure = np.linalg.norm(apart) > SURE * sigma * np.sqrt(axes)
     # both parts must be held by tiles that agree with the model, not by a few that do not
     held = min(torn.weights[best].sum(), torn.weights[~best].sum())
-    if not sure or held < 0.5 * LEAST_SHARE * count:
+    if not sure or held < max(0.5 * LEAST_SHARE * count, LEAST_HELD):
         return None
     best = best if 2 * best.sum() <= count else ~best
     away = arm[best].mean(axis=0) - arm[~best].mean(axis=0)
     side = _SIDES[round(float(np.arctan2(away[1], away[0])) / (np.pi / 4)) % 8]
-    return Tear(np.asarray(apart), sigma, float(best.mean()), side)
+    return Tear(np.asarray(apart), sigma, float(best.mean()), side, places[best])
 
 
 @dataclass(frozen=True, eq=False)

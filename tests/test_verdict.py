@@ -17,7 +17,8 @@ from meshreg.heights import fit_heights
 from meshreg.judge import Judgement
 from meshreg.layers import second_surface
 from meshreg.raster import rasterize
-from meshreg.tears import Tear, find_tear
+from meshreg.tears import Tear, contradicts, find_tear
+from meshreg.tiles import TileOffsets
 from meshreg.types import SourceFile, Transform
 from meshreg.verdict import Found, Stretch, findings, last_word
 
@@ -132,6 +133,35 @@ def test_a_torn_model_shows_two_populations(apart, split):
         smaller = min(part.mean(), 1 - part.mean())
         assert abs(tear.share - smaller) < 0.12
         assert np.hypot(*(np.abs(tear.apart) - np.abs(apart))) < 0.1
+
+
+def test_three_tiles_that_match_wrongly_alike_are_no_tear():
+    places = lattice()
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        values = bent(places, rng, 0.03) + rng.normal(0, 0.02, (36, 2))
+        lost = rng.permutation(36)[:9]
+        values[lost] = rng.uniform(-1, 1, (9, 2))
+        corner = np.argsort(places.sum(axis=1))[:3]
+        values[corner] = [0.4, 0.8] + rng.normal(0, 0.07, (3, 2))
+        assert find_tear(places, values, 0.005) is None
+
+
+@pytest.mark.parametrize("torn", [True, False])
+def test_the_other_channel_may_contradict_a_tear(torn):
+    """What the image alone shows is ground that has changed; a torn model takes both along."""
+    rng = np.random.default_rng(3)
+    places = lattice()
+    values = rng.normal(0, 0.01, (36, 2))
+    part = places[:, 0] < 4.0
+    values[part] += [0.3, 0.1]
+    tear = find_tear(places, values, 0.005)
+    assert tear is not None
+    np.testing.assert_array_equal(tear.places, places[part])
+    other = places[::2] + 0.7
+    offsets = rng.normal(0, 0.02, (len(other), 2)) + torn * (other[:, :1] < 4.5) * [0.3, 0.1]
+    number = np.arange(len(other))
+    assert contradicts(TileOffsets(other, offsets, number, 0 * number), tear) is not torn
 
 
 def test_a_smooth_bend_is_no_tear():
