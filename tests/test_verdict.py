@@ -143,7 +143,7 @@ def test_three_tiles_that_match_wrongly_alike_are_no_tear():
         lost = rng.permutation(36)[:9]
         values[lost] = rng.uniform(-1, 1, (9, 2))
         corner = np.argsort(places.sum(axis=1))[:3]
-        values[corner] = [0.4, 0.8] + rng.normal(0, 0.07, (3, 2))
+        values[corner] = np.array([0.4, 0.8]) + rng.normal(0, 0.07, (3, 2))
         assert find_tear(places, values, 0.005) is None
 
 

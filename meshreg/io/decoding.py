@@ -57,16 +57,14 @@ class Decoder:
         self, kind: str, path: Path | None, slot: int = 0, data: bytes | None = None, **setup: Any
     ) -> None:
         self.path, self.place = path, ""
+        self._slot = slot
         if path is not None:
             with open_regular(path) as stream:
                 size = os.fstat(stream.fileno()).st_size
         else:
             size = len(data or b"")
-        self._slot, self._block = slot, _shared(2 * slot) if slot else None
-        given = None if path is not None else _shared(0)
-        if given is not None:
-            with open(given, "wb", closefd=False) as out:
-                out.write(data or b"")
+        self._block = self._shared(2 * slot) if slot else None
+        given = None if path is not None else self._shared(size, data or b"")
         handles = [handle for handle in (self._block, given) if handle is not None]
         arguments = {
             "kind": kind,
@@ -88,11 +86,7 @@ class Decoder:
                 pass_fds=handles,
             )
         except OSError as error:
-            raise ResourceLimitError(
-                f"its decoder cannot be started: {error.strerror}.",
-                file=path,
-                remedy="Close other programs.",
-            ) from error
+            raise self._limit("its decoder cannot be started", error) from error
         finally:
             for handle in handles:
                 os.close(handle)
@@ -140,6 +134,21 @@ class Decoder:
         if "error" in answer:
             self._fail(str(answer["error"]).rstrip("."))
         return answer
+
+    def _shared(self, size: int, data: bytes = b"") -> int:
+        try:
+            handle = _shared(size)
+            if data:
+                with open(handle, "wb", closefd=False) as out:
+                    out.write(data)
+        except OSError as error:
+            raise self._limit("memory for its decoder is not to be had", error) from error
+        return handle
+
+    def _limit(self, what: str, error: OSError) -> ResourceLimitError:
+        return ResourceLimitError(
+            f"{what}: {error.strerror}.", file=self.path, remedy="Close other programs."
+        )
 
     def _fail(self, why: str) -> None:
         raise InputError(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import struct
@@ -70,6 +71,16 @@ def test_a_decoder_leaves_no_process_and_no_handle(tmp_path):
     assert set(os.listdir("/proc/self/fd")) == before
     children = Path(f"/proc/self/task/{os.getpid()}/children").read_text().split()
     assert children == []
+
+
+def test_memory_that_a_decoder_does_not_get_is_no_damage_of_the_file(tmp_path, monkeypatch):
+    def none(handle, size):
+        raise OSError(errno.EFBIG, os.strerror(errno.EFBIG))
+
+    laz_of(tmp_path / "a.laz", 1000)
+    monkeypatch.setattr(decoding.os, "ftruncate", none)
+    with pytest.raises(ResourceLimitError, match="decoder"):
+        read_survey(tmp_path / "a.laz")
 
 
 def test_a_decoder_has_a_bound_on_its_memory(tmp_path, monkeypatch):
