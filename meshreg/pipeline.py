@@ -20,6 +20,7 @@ from meshreg import judge as judging
 from meshreg import statistics
 from meshreg.decision import Clock, Decision, Manual, Progress, completed, decide
 from meshreg.errors import InputError, UsageError
+from meshreg.far_pose import far_pose
 from meshreg.gain import Gain
 from meshreg.heading import Pairs, turning
 from meshreg.heights import STABLE, Heights, stable_ground
@@ -43,7 +44,7 @@ from meshreg.types import (
     Transform,
     Warp,
 )
-from meshreg.verdict import findings, last_word
+from meshreg.verdict import Found, findings, last_word
 from meshreg.voting import Turn
 from meshreg.warp import Internal, check_model, measure
 from meshreg.warp_rasters import warped_raster
@@ -153,8 +154,7 @@ def register_pair(  # noqa: PLR0913
     found = dataclasses.replace(found, layers=layers, dips=dips, tilt=_tilt(transform))
     notes += _counted(layers)
     if last_word(decision.placed, findings(found)).verdict != "accepted":
-        axes = _axes(reference, moving, decision, settings, radius)
-        found = dataclasses.replace(found, axes=axes)
+        found = _explained(found, reference, moving, decision, settings, radius, pairs)
     against = findings(found)
     judgement = last_word(decision.placed, against)
     if judgement.verdict != "accepted":  # how far off it may be is not known
@@ -247,6 +247,21 @@ def _axes(
             exchange[2, 2] = -1.0
         said = axes_after(reference, moving, exchange, f"the {agree[0]}")
     return said or other_axes(reference, moving, radius)
+
+
+def _explained(
+    found: Found,
+    reference: Survey,
+    moving: Survey,
+    decision: Decision,
+    settings: Settings,
+    radius: float,
+    pairs: Pairs,
+) -> Found:
+    """Try other axes on a pair that is not accepted, and a far turn or scale on a rejected one."""
+    axes = _axes(reference, moving, decision, settings, radius)
+    lost = decision.placed.verdict == "rejected" and not axes
+    return dataclasses.replace(found, axes=axes, far=far_pose(pairs, radius) if lost else "")
 
 
 def _gain(gain: Gain | None) -> dict[str, Any] | None:

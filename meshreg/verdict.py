@@ -75,6 +75,8 @@ class Found:
         Tilt of each survey's own surface [degrees].
     axes : str
         Which axes would make the surveys agree, where they do not and others were tried.
+    far : str
+        At which turn or scale, beyond those that are searched, the surveys would fit.
     tilt : float
         Applied [degrees].
     layers : pair of Layer or None
@@ -97,6 +99,7 @@ class Found:
     step: Tear | None = None
     dips: tuple[float, float] | None = None
     axes: str = ""
+    far: str = ""
     tilt: float = 0.0
     layers: tuple[Layer | None, Layer | None] = (None, None)
     sigma_up: float = 0.0
@@ -212,6 +215,7 @@ Rule = Callable[[Found], str]
 # In the order in which they are told: what explains other findings comes first.
 RULES: tuple[tuple[str, Rule], ...] = (
     ("axes", lambda found: found.axes),
+    ("far", lambda found: found.far),
     ("upright", _upright),
     ("lean", _lean),
     ("layers", _layered),

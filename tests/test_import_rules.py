@@ -53,12 +53,24 @@ RULES: dict[str, set[str]] = {
     "judge": BASE | {"raster", "offsets"},
     "levels": BASE | {"offsets", "raster", "statistics"},
     "narrowing": BASE | {"judge", "offsets", "raster", "tile_surfaces", "voting"},
+    "far_pose": BASE | {"judge", "offsets", "raster", "tile_surfaces"},
     "search_cost": BASE | {"io", "narrowing", "offsets"},
     "decision": BASE
     | {"heading", "heights", "held_out", "judge", "kriging", "narrowing", "offsets", "refine"}
     | {"statistics", "tears", "tile_surfaces", "tiles", "verdict", "voting"},
     "pipeline": BASE
-    | {"decision", "gain", "heading", "heights", "judge", "layers", "levels", "offsets", "posture"}
+    | {
+        "decision",
+        "far_pose",
+        "gain",
+        "heading",
+        "heights",
+        "judge",
+        "layers",
+        "levels",
+        "offsets",
+        "posture",
+    }
     | {"raster", "refine", "search_cost", "statistics", "surfaces", "voting", "verdict", "warp"}
     | {"warp_rasters"},
     "ties": BASE | {"io", "raster", "offsets", "statistics", "report"},
