@@ -43,7 +43,7 @@ from meshreg.types import (
     Transform,
 )
 from meshreg.verdict import Found, Stretch, findings, last_word
-from meshreg.voting import STANDS_OUT, Turn, vote
+from meshreg.voting import PLAIN_SCALE, STANDS_OUT, Turn, vote
 
 log = logging.getLogger(__name__)
 Progress = Callable[[str, float], None]
@@ -178,8 +178,10 @@ def _asked(
         known = delivered.judgement.verdict != "rejected"
         better = decision.judgement.false_alarm < delivered.judgement.false_alarm
         return decision if better or not known else delivered
-    if decision.found.turned and decision.judgement.verdict != "accepted":
-        # the finer tiles contradict the turn: few of the coarse ones told it
+    # the finer tiles may contradict the turn or the scale, if few of the coarse ones told it
+    unneeded = turn.scale != 1.0 and abs(decision.scale - 1) < PLAIN_SCALE
+    unneeded = unneeded and not settings.search.free_scale
+    if decision.judgement.verdict != "accepted" and (decision.found.turned or unneeded):
         delivered = in_frame(pairs, settings, radius, clock, manual, None)
         return delivered if delivered.judgement.verdict == "accepted" else decision
     if decision.judgement.verdict != "rejected":

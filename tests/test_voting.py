@@ -12,7 +12,7 @@ import seafloor
 
 from data_synth.rasters import make_rasters
 from data_synth.recipe import load
-from meshreg import Mesh, Settings, Survey, apply_transform, register_pair
+from meshreg import Mesh, Settings, Survey, apply_transform, decision, heading, register_pair
 from meshreg.benchmark.measure import register_rasters
 from meshreg.judge import judge
 from meshreg.raster.grid import coarsened
@@ -347,3 +347,19 @@ def test_a_long_beach_votes_on_its_own_cells(yaw_deg, scale):
     # a tile that is turned runs off its peak; a turned survey is measured anew once it is straight
     assert turn.stretch == pytest.approx(1 / scale, abs=0.01 if yaw_deg else 0.002)
     assert turn.scale == (turn.stretch if scale != 1 else 1.0)
+
+
+@pytest.mark.parametrize(("yaw", "scale"), [(0.05, 1.0), (0.0, 0.975)])
+def test_a_vote_that_the_finer_tiles_contradict_is_given_up(monkeypatch, yaw, scale):
+    """Four tiles of a small overlap may vote for anything, and stand out at the right place."""
+    pairs = rasters(0)
+    true = vote(pairs, SEARCH, 5.0)
+    wrong = dataclasses.replace(true, yaw=yaw, scale=scale, stretch=scale, gap=20.0)
+    assert wrong.proven
+    assert wrong.needed
+    monkeypatch.setattr(decision, "vote", lambda *_: wrong)
+    monkeypatch.setattr(heading, "settled", lambda pairs, turn, guess: turn)
+    found = register_rasters(pairs, QUICK, 5.0)
+    assert found.judgement.verdict == "accepted", found.judgement.reason
+    assert found.motion is None
+    assert found.scale == 1.0
