@@ -139,6 +139,7 @@ def register_pair(  # noqa: PLR0913
                 covariance, said.transform, said.transform.apply(place)
             )
         transform, notes = said.transform, [*notes, said.note]
+        found = dataclasses.replace(found, surfaces=said.doubt)
     if settled is not None and transform is not None and settings.warp.model == "none":
         settled(transform)
     with clock.stage("apply"):

@@ -23,6 +23,7 @@ from meshreg.sandwich import block_sandwich
 from meshreg.types import Bool, Float64, Grid, Maps, Mesh, Survey, Transform
 
 GATE = 0.03  # m: points further apart have changed, or are not the same surface
+PLAINLY = 0.8  # of the distance before: on level ground a slide changes little
 MAX_POINTS = 1_000_000
 BLOCKS = 7  # along the longer side: parcels of ground that err alike
 
@@ -49,6 +50,8 @@ class Polished:
         East, north, up [m] and right-handed turns about these [rad] that were added there.
     scatter : (6, 6) float64
         Covariance of the step there, from blocks of ground; zero where they are too few.
+    doubt : str
+        Why the answer that was given cannot be accepted, if so.
     """
 
     transform: Transform
@@ -60,6 +63,7 @@ class Polished:
     home: Float64 = field(default_factory=lambda: np.zeros(3))
     step: Float64 = field(default_factory=lambda: np.zeros(6))
     scatter: Float64 = field(default_factory=lambda: np.zeros((6, 6)))
+    doubt: str = ""
 
     def widened(self, covariance: Float64) -> Float64:
         """Return what the covariance (7, 7) at `home` of the pose given becomes.
@@ -161,9 +165,14 @@ def polish(  # noqa: PLR0913, PLR0917
     length = float(np.linalg.norm(step.offset))
     if not (small and better):
         why = "it does not bring them closer" if small else f"it would move it by {length:.3f} m"
-        return Polished(
-            transform, False, length, before, after, f"polishing on the surfaces is left out: {why}"
-        )
+        left_out = f"polishing on the surfaces is left out: {why}"
+        doubt = ""
+        if better and after < PLAINLY * before:
+            doubt = (
+                f"the surfaces themselves fit better {length:.2g} m away ({1000 * before:.1f} to "
+                f"{1000 * after:.1f} mm rms), further than the answer may err"
+            )
+        return Polished(transform, False, length, before, after, left_out, doubt=doubt)
     turn = 0.5 * (step.rotation - step.rotation.T)  # of milliradians: the vector of the turn
     taken = np.append(step.offset, [turn[2, 1], turn[0, 2], turn[1, 0]])
     step = Transform(step.rotation, 1.0, step.offset, home)

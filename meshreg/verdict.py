@@ -86,6 +86,8 @@ class Found:
         Range of 98 % of the reference's heights [m].
     undecided : float
         What tones and edges of the image disagree by, in cells, where it alone tells the place.
+    surfaces : str
+        Where both surfaces ask to lie instead (`meshreg.surfaces`).
     ties : str
         In what hand-picked points contradict the answer.
     """
@@ -105,6 +107,7 @@ class Found:
     sigma_up: float = 0.0
     relief: float = float("inf")
     undecided: float = 0.0
+    surfaces: str = ""
     ties: str = ""
 
 
@@ -225,13 +228,16 @@ RULES: tuple[tuple[str, Rule], ...] = (
     ("tilt", lambda found: found.tilted),
     ("yaw", lambda found: found.turned),
     ("light", _undecided),
+    ("surfaces", lambda found: found.surfaces),
     ("up", _uncertain_up),
     ("ties", lambda found: found.ties),
 )
 
 
 # What a survey that stands upright, seen from above, brings with it.
-OF_UPRIGHT = frozenset(("layers", "tear", "heights", "scale", "tilt", "yaw", "light", "up"))
+OF_UPRIGHT = frozenset(
+    ("layers", "tear", "heights", "scale", "tilt", "yaw", "light", "surfaces", "up")
+)
 
 
 def findings(found: Found) -> tuple[Finding, ...]:

@@ -17,6 +17,7 @@ from meshreg import Maps, Mesh, PointCloud, Survey, apply_transform
 from meshreg.errors import UsageError
 from meshreg.surfaces import check_surfaces, polish, sampled
 from meshreg.types import Grid, Transform
+from meshreg.verdict import Found, findings
 
 ROOT = Path(__file__).parent.parent
 SIGMA = {"x": 0.004, "y": 0.004, "z": 0.004}
@@ -105,6 +106,19 @@ def test_a_small_motion_is_taken_back(kind, aligner):
     assert np.linalg.eigvalsh(after - before).min() > -1e-15
     assert np.sqrt(np.diag(after - before)[:3]) == pytest.approx(np.abs(found.step[:3]), abs=0.001)
     assert 0 < np.sqrt(found.scatter[:3, :3].diagonal()).max() < 0.001
+
+
+@pytest.mark.parametrize("off", [0.0, 0.045])
+def test_a_move_further_than_the_answer_may_err_is_a_doubt(off):
+    """Four and a half centimetres at a stated four millimetres: not taken, and said."""
+    start = Transform(offset=(off, 0.0, 0.0))
+    found = polish(reef(1), reef(2), start, np.zeros(3), SIGMA, everywhere(), max_points=25_000)
+    assert bool(found.doubt) is (off > 0)
+    if off:
+        assert found.transform is start
+        assert "fit better 0.045 m away" in found.doubt
+        against = findings(Found(surfaces=found.doubt))
+        assert [finding.code for finding in against] == ["surfaces"]
 
 
 def test_surfaces_that_lie_right_already_stay():
