@@ -19,6 +19,7 @@ from meshreg.types import Bool, Float64
 
 LEAST_TILES = 16
 LEAST_SHARE = 0.12  # of the tiles: a smaller piece is ground that has changed
+ABRUPT = 4.0  # times as far apart are neighbours across a tear as others; across a bend, up to 2.6
 LEAST_HELD = 3.0  # tiles: two or three that match wrongly may be alike by chance
 FALL = 0.5  # a jump must bring the squared error below this share of a smooth bend's
 SURE = 5.0  # sigmas
@@ -131,6 +132,8 @@ def find_tear(places: Float64, values: Float64, resolution: float) -> Tear | Non
     held = min(torn.weights[best].sum(), torn.weights[~best].sum())
     if not sure or held < max(0.5 * LEAST_SHARE * count, LEAST_HELD):
         return None
+    if not _abrupt(places[kept], values[kept], best[kept]):
+        return None
     best = best if 2 * best.sum() <= count else ~best
     away = arm[best].mean(axis=0) - arm[~best].mean(axis=0)
     side = _SIDES[round(float(np.arctan2(away[1], away[0])) / (np.pi / 4)) % 8]
@@ -176,6 +179,21 @@ def _errors_with(base: Float64, regions: Bool, values: Float64, weights: Float64
     jumps = jumps - ortho @ (ortho.T @ jumps)
     power = np.maximum((jumps**2).sum(axis=0), 1e-9)
     return np.asarray((left**2).sum() - ((jumps.T @ left) ** 2).sum(axis=1) / power)
+
+
+def _abrupt(places: Float64, values: Float64, part: Bool) -> bool:
+    """Whether neighbours across the line differ by more than neighbours elsewhere do.
+
+    A bend of a wavelength not much longer than the tiles changes as much everywhere.
+    """
+    from scipy.spatial import cKDTree
+
+    near = cKDTree(places).query(places, k=min(5, len(places)))[1][:, 1:]
+    steps = np.linalg.norm(values[near] - values[:, None], axis=2)
+    across = part[near] != part[:, None]
+    if not across.any() or across.all():
+        return True
+    return bool(np.median(steps[across]) > ABRUPT * np.median(steps[~across]))
 
 
 def _polynomials(arm: Float64, degree: int) -> Float64:
