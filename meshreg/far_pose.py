@@ -6,6 +6,7 @@ the neutral measure, and one is named where it stands out far beyond what so man
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Mapping
 from dataclasses import replace
@@ -15,9 +16,11 @@ import numpy as np
 from meshreg.judge import channel_maps
 from meshreg.offsets.correlate import Window
 from meshreg.raster.grid import coarsened
+from meshreg.settings import SearchSettings
 from meshreg.tile_surfaces import near_offset
 from meshreg.types import Float32, Grid, SurveyRaster
 
+log = logging.getLogger(__name__)
 ACROSS = 60  # coarse cells across the moving survey
 STEP, RATIO = 5, 1.04  # degrees, and from one scale to the next
 FOOT = 0.3048
@@ -25,7 +28,9 @@ OVERWHELMING = 7.0  # deviations in one channel: on unrelated ground all trials 
 MOST = 300_000  # cells of a transform, so that all trials take seconds
 
 
-def far_pose(pairs: Mapping[str, tuple[SurveyRaster, SurveyRaster]], radius: float) -> str:
+def far_pose(
+    pairs: Mapping[str, tuple[SurveyRaster, SurveyRaster]], radius: float, search: SearchSettings
+) -> str:
     """Name the turn or the scale at which the surveys would fit; '' for none.
 
     Parameters
@@ -34,13 +39,18 @@ def far_pose(pairs: Mapping[str, tuple[SurveyRaster, SurveyRaster]], radius: flo
         "dem" to (reference, moving), with their colors.
     radius : float
         Half width of the search window [m].
+    search : SearchSettings
+        What was searched already: `max_yaw` [degrees] and `max_scale`.
     """
     reference, moving = pairs["dem"]
     reference = near_offset(reference, moving, (0.0, 0.0), radius)
     times = max(1, round(math.sqrt(max(int(moving.valid.sum()), 1)) / ACROSS))
     reference, moving = coarsened(reference, times), coarsened(moving, times)
     window = Window.around(_snapped(reference).grid, _snapped(moving).grid, radius)
-    if window.empty or math.prod(window.padded) > MOST:
+    if window.empty:
+        return ""
+    if math.prod(window.padded) > MOST:
+        log.info("no far turn or scale was tried: the search window is too large")
         return ""
     reference = _snapped(reference)
     tried = [(math.radians(yaw), 1.0) for yaw in range(-180, 180, STEP)]
@@ -55,12 +65,12 @@ def far_pose(pairs: Mapping[str, tuple[SurveyRaster, SurveyRaster]], radius: flo
         if max(gaps, default=0.0) >= OVERWHELMING and sum(gaps) > best:
             best, found = sum(gaps), (yaw, scale)
     yaw, scale = found
-    if abs(yaw) >= math.radians(STEP):
+    if abs(yaw) > math.radians(search.max_yaw + 0.5 * STEP):
         return (
             f"the moving survey is turned by about {-math.degrees(yaw):+.0f}°, further than is "
             "searched: check its heading, or turn it back first"
         )
-    if scale != 1.0:
+    if abs(math.log(scale)) > math.log1p(search.max_scale) + 0.5 * math.log(RATIO):
         return (
             f"the moving survey is about {1 / scale:.2g} times as large as the reference, further "
             "off than is searched: check the units (--unit) and the scale"

@@ -262,7 +262,8 @@ def _explained(
     """Try other axes on a pair that is not accepted, and a far turn or scale on a rejected one."""
     axes = _axes(reference, moving, decision, settings, radius)
     lost = decision.placed.verdict == "rejected" and not axes
-    return dataclasses.replace(found, axes=axes, far=far_pose(pairs, radius) if lost else "")
+    far = far_pose(pairs, radius, settings.search) if lost else ""
+    return dataclasses.replace(found, axes=axes, far=far)
 
 
 def _gain(gain: Gain | None) -> dict[str, Any] | None:

@@ -9,7 +9,7 @@ anything better than it was.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -249,4 +249,7 @@ def findings(found: Found) -> tuple[Finding, ...]:
 
 def last_word(judgement: Judgement, against: Sequence[Finding]) -> Judgement:
     """Return the judgement of the place, no better than "review" where anything speaks against."""
-    return judgement.doubted("; ".join(finding.said for finding in against))
+    said = "; ".join(finding.said for finding in against)
+    if any(finding.code == "far" for finding in against):  # it explains why nothing was found
+        return replace(judgement.doubted(said), reason=said)
+    return judgement.doubted(said)

@@ -53,7 +53,7 @@ RULES: dict[str, set[str]] = {
     "judge": BASE | {"raster", "offsets"},
     "levels": BASE | {"offsets", "raster", "statistics"},
     "narrowing": BASE | {"judge", "offsets", "raster", "tile_surfaces", "voting"},
-    "far_pose": BASE | {"judge", "offsets", "raster", "tile_surfaces"},
+    "far_pose": BASE | {"judge", "offsets", "raster", "settings", "tile_surfaces"},
     "search_cost": BASE | {"io", "narrowing", "offsets"},
     "decision": BASE
     | {"heading", "heights", "held_out", "judge", "kriging", "narrowing", "offsets", "refine"}

@@ -40,6 +40,18 @@ def test_methods_that_are_not_asked_cost_nothing():
     assert 0.5 * plain.memory < without.memory < 0.75 * plain.memory
 
 
+def test_the_radius_that_the_refusal_names_is_the_largest_that_fits(monkeypatch):
+    pair = grids(30, 30, 0.03)
+    monkeypatch.setattr("meshreg.io.safe.free_memory", lambda: 6e9)
+    with pytest.raises(ResourceLimitError, match=r"search\.radius 30 m") as caught:
+        require_search(pair, Settings(), 30.0)
+    radius = float(re.search(r"--search-radius ([\d.]+)", str(caught.value))[1])
+    assert 0 < radius < 30
+    assert require_search(pair, Settings(), radius).memory <= 6e9
+    with pytest.raises(ResourceLimitError):
+        require_search(pair, Settings(), 1.3 * radius)
+
+
 @pytest.mark.parametrize("free", [2e9, 8e9, 3e10])
 def test_what_the_refusal_names_fits(free, monkeypatch):
     """A hundred metres on both sides at 1 cm, sought to 100 m: the remedies are true ones."""
@@ -48,9 +60,7 @@ def test_what_the_refusal_names_fits(free, monkeypatch):
     with pytest.raises(ResourceLimitError, match=r"search\.radius 100 m") as caught:
         require_search(pair, Settings(), 100.0)
     assert caught.value.exit_code == 5
-    radius = re.search(r"--search-radius ([\d.e-]+)", str(caught.value))
-    if radius:
-        assert require_search(pair, Settings(), float(radius[1])).memory <= free
+    assert "--search-radius" not in str(caught.value), "no radius fits"
     ortho, dem = (
         float(re.search(rf"--{name}-cell ([\d.e-]+)", str(caught.value))[1])
         for name in ("ortho", "dem")
