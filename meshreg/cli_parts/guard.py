@@ -12,6 +12,7 @@ import ctypes
 import os
 import shutil
 import signal
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -41,24 +42,25 @@ class Unfinished:
     """Temporary folders of the running job, for when it cannot remove them itself."""
 
     def __init__(self) -> None:
-        self._folders: set[Path] = set()
+        self._folders: dict[Path, os.stat_result] = {}
 
     @contextmanager
     def holding(self, folder: Path) -> Iterator[Path]:
         """Know of `folder` while the block runs."""
-        self._folders.add(folder)
+        self._folders[folder] = os.lstat(folder)
         try:
             yield folder
         finally:
-            self._folders.discard(folder)
+            self._folders.pop(folder, None)
 
     def remove(self) -> None:
         """Delete the folders and the locks beside them; the job may still be writing there."""
-        for folder in self._folders:
+        for folder, made in list(self._folders.items()):
             for _ in range(5):
-                shutil.rmtree(folder, ignore_errors=True)
-                if not folder.exists():
+                # once it has changed places with the result that it replaces, it is not ours
+                if not (folder.exists() and os.path.samestat(os.lstat(folder), made)):
                     break
+                shutil.rmtree(folder, ignore_errors=True)
                 time.sleep(0.02)
             folder.with_suffix(".lock").unlink(missing_ok=True)
 
@@ -128,6 +130,8 @@ def _stop(
     thread: threading.Thread, done: threading.Event, unfinished: Unfinished, number: int
 ) -> None:
     """Ask the thread to end; where it does not, remove its folders and end the process."""
+    # CPython may hand it to a thread that the job is just starting, which prints it
+    sys.unraisablehook = lambda _: None
     asked = ctypes.c_ulong(thread.ident or 0)
     ctypes.pythonapi.PyThreadState_SetAsyncExc(asked, ctypes.py_object(StoppedError))
     if done.wait(PATIENCE):

@@ -163,7 +163,11 @@ def _shared(size: int) -> int:
     else:
         with tempfile.TemporaryFile() as stream:
             handle = os.dup(stream.fileno())
-    os.ftruncate(handle, size)
+    try:
+        os.ftruncate(handle, size)
+    except BaseException:
+        os.close(handle)
+        raise
     return handle
 
 

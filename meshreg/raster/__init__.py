@@ -82,7 +82,7 @@ def rasterize(
             f"The grid is in {grid.crs}, {survey.name} in {survey.crs}.",
             remedy="Bring the survey to the grid's CRS first (meshreg.io.frames.reframe).",
         )
-    require_together(survey, grid.cell)
+    require_together(survey, grid.cell, grid)
     check_size(grid, settings.max_cells)
     layers, texel, datum = _layers(survey, grid, settings, transform, spacing)
     raster = finished(layers, grid, settings, texel, datum, mask, transform)

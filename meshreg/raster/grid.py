@@ -101,12 +101,12 @@ def check_size(grid: Grid, max_cells: int) -> None:
         )
 
 
-def require_together(survey: Survey, cell: float) -> None:
+def require_together(survey: Survey, cell: float, grid: Grid | None = None) -> None:
     """Refuse a survey whose lattice would be enormous for the sake of a few points far away.
 
-    A raster's cost grows with the box around all points, whatever lies in it. The box around all
-    but a hundredth of them (half of it at each end, by coordinate) is compared, both in whole
-    blocks of 512 × 512 cells.
+    A raster's cost grows with its lattice, whatever lies in it. `grid` is compared with the box
+    around all points but a hundredth (half of it at each end, by coordinate), both in whole blocks
+    of 512 × 512 cells; without it the box around all points.
 
     Raises
     ------
@@ -117,6 +117,10 @@ def require_together(survey: Survey, cell: float) -> None:
         return
     points = survey.geometry.points
     bounds = survey_bounds(survey)
+    extent = bounds[:, :2]
+    if grid is not None:
+        reach = np.array([grid.shape[1], grid.shape[0]]) * grid.cell
+        extent = np.array([[0.0, 0.0], reach])
     sample = points[:: max(1, len(points) // _LOOKED_AT), :2]
     sample = sample[np.isfinite(sample).all(axis=1)]
     # by rank, so that of a handful of points one is left out at each end as well
@@ -125,7 +129,7 @@ def require_together(survey: Survey, cell: float) -> None:
         low = np.maximum(low, np.partition(sample, 1, axis=0)[1])
         high = np.minimum(high, np.partition(sample, -2, axis=0)[-2])
     middle = np.array([low, high]) + survey.origin[:2]
-    if _blocks(bounds[:, :2], cell) <= _APART * _blocks(middle, cell):
+    if _blocks(extent, cell) <= _APART * _blocks(middle, cell):
         return
     side = np.maximum(high - low, cell)
     far = np.flatnonzero(((points[:, :2] < low - side) | (points[:, :2] > high + side)).any(axis=1))
