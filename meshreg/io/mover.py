@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from meshreg.errors import UsageError
+from meshreg.errors import InputError, UsageError
 from meshreg.io.bridge import bridge
 from meshreg.types import Float64, Frame, SourceFile, Transform, Warp
 
@@ -152,8 +152,16 @@ def frame_matrix(frame: Frame) -> Float64:
 def _tangent(frame: Frame, centre: Float64) -> Float64:
     """Return d absolute / d file (3, 3) at a place, by central differences over some 20 m."""
     step = np.abs(to_file(frame, to_absolute(frame, centre[None]) + 10.0) - centre).max(axis=0)
-    ends = to_absolute(frame, np.concatenate([centre + np.diag(step), centre - np.diag(step)]))
-    return np.asarray(((ends[:3] - ends[3:]) / (2 * step[:, None])).T)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ends = to_absolute(frame, np.concatenate([centre + np.diag(step), centre - np.diag(step)]))
+        tangent = np.asarray(((ends[:3] - ends[3:]) / (2 * step[:, None])).T)
+    if not (np.isfinite(tangent).all() and np.linalg.norm(tangent, axis=0).all()):
+        raise InputError(
+            f"Neighbouring places are not told apart by the coordinates of {frame.crs} at "
+            f"{', '.join(f'{value:.10g}' for value in centre)}.",
+            remedy="Correct the CRS (.prj, .survey.toml): one of its units or parameters is wrong.",
+        )
+    return tangent
 
 
 def _rotation_in(linear: Float64) -> Float64:

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import laspy
 import numpy as np
+import pyproj
 import pytest
 import rasterio
 from rasterio import Affine
@@ -380,3 +381,13 @@ def test_pages_of_few_bytes_are_not_decoded_all_at_once():
 
     assert groups(1_000) == 4  # two pages of 100 MB fit 256 MiB
     assert groups(50_000_000) == 1
+
+
+def test_a_crs_whose_degree_is_no_angle_is_refused(tmp_path):
+    """Its unit is so large that all places are one: nothing can be turned in it."""
+    wkt = pyproj.CRS("EPSG:32754").to_wkt("WKT1_ESRI")
+    (tmp_path / "a.prj").write_text(wkt.replace("0.0174532925199433", "99999999999999999999"))
+    points = np.random.default_rng(3).uniform(0, 10, (60, 3)) + np.array([731_000, 5_705_000, -12])
+    np.savetxt(tmp_path / "a.xyz", points, fmt="%.3f")
+    with pytest.raises(InputError, match=r"CRS|coordinates"):
+        rewrite_survey(read_survey(tmp_path / "a.xyz"), MOVE, tmp_path / "out")
