@@ -130,8 +130,11 @@ def _stop(
     thread: threading.Thread, done: threading.Event, unfinished: Unfinished, number: int
 ) -> None:
     """Ask the thread to end; where it does not, remove its folders and end the process."""
-    # CPython may hand it to a thread that the job is just starting, which prints it
-    sys.unraisablehook = lambda _: None
+    before = sys.unraisablehook
+    # CPython may hand it to a thread that the job is just starting, which would print it
+    sys.unraisablehook = lambda what: (
+        None if isinstance(what.exc_value, StoppedError) else before(what)
+    )
     asked = ctypes.c_ulong(thread.ident or 0)
     ctypes.pythonapi.PyThreadState_SetAsyncExc(asked, ctypes.py_object(StoppedError))
     if done.wait(PATIENCE):
