@@ -142,7 +142,7 @@ def decide(
         motion; without it a survey that needs turning is looked at as it is.
     """
     clock = Clock(progress or (lambda stage, fraction: None))
-    times = _narrowing(pairs, radius)
+    times = narrowing(_grids(pairs["dem"]), _grids(pairs["ortho"]), radius)
     if times > 1:
         return _narrowed(pairs, settings, radius, clock, manual, turned, times)
     return _asked(pairs, settings, radius, clock, manual, turned)
@@ -187,10 +187,6 @@ def _asked(
     if decision.judgement.verdict != "rejected":
         return decision
     return in_frame(pairs, settings, radius, clock, manual, turn)
-
-
-def _narrowing(pairs: Pairs, radius: float) -> int:
-    return narrowing(_grids(pairs["dem"]), _grids(pairs["ortho"]), radius)
 
 
 def _narrowed(

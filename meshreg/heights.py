@@ -156,9 +156,7 @@ def fit_heights(
 
 def _height_step(pair: DemPair, transform: Transform) -> Tear | None:
     """Find two populations of height among blocks of recurring ground."""
-    recurs = pair.where_detail_recurs(
-        transform, 0.0
-    )  # each block is asked whether enough of it does
+    recurs = pair.where_detail_recurs(transform, 0.0)  # blocks are asked whether enough does
     row, col = pair.row[recurs.counts], pair.col[recurs.counts]
     if not row.size:
         return None

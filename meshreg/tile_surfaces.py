@@ -64,7 +64,11 @@ def channel_surfaces(
     times = max(1, round(cell / moving.grid.cell))
     arm = 0.5 * math.hypot(*moving.grid.shape) * moving.grid.cell
     half = radius + arm * turn + 2 * cell
-    reference, moving = _near(reference, moving, half), _near(moving, reference, half)
+    here = (0.0, 0.0)
+    reference, moving = (
+        near_offset(reference, moving, here, half),
+        near_offset(moving, reference, here, half),
+    )
     if min(*reference.grid.shape, *moving.grid.shape) < TILE_CELLS[0] // 2 * times:
         return None
     reference, moving = coarsened(reference, times), coarsened(moving, times)
@@ -172,11 +176,6 @@ def near_offset(
     left = int(np.clip((west - half - grid.west) / grid.cell, 0, cols - 1))
     right = int(np.clip(math.ceil((east + half - grid.west) / grid.cell), left + 1, cols))
     return part_of(raster, slice(top, bottom), slice(left, right))
-
-
-def _near(raster: SurveyRaster, other: SurveyRaster, half: float) -> SurveyRaster:
-    """Cut off what lies further than `half` metres from the other raster."""
-    return near_offset(raster, other, (0.0, 0.0), half)
 
 
 def part_of(raster: SurveyRaster, rows: slice, cols: slice) -> SurveyRaster:

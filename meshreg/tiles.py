@@ -222,16 +222,14 @@ def spread_of_fields(
     cell, side = moving.grid.cell, tiles.side
     some = np.linspace(0, len(tiles.places) - 1, min(len(tiles.places), STACKED)).astype(int)
     row, col = moving.grid.row_col(*tiles.places[some].T)
-    nominal = np.rint(
-        [(reference.grid.north - moving.grid.north), (moving.grid.west - reference.grid.west)]
-        / np.array(cell)
-    )
-    steps = np.rint(tiles.offsets[some, ::-1] * [-1, 1] / cell) + nominal
+    shifts = [
+        Overlap.at(reference.grid, moving.grid, (float(east), float(north))).shift
+        for east, north in tiles.offsets[some]
+    ]
 
     def stacked(at: int) -> Float64 | None:
         corner = round(row[at] - 0.5 * (side - 1)), round(col[at] - 0.5 * (side - 1))
-        shift = int(steps[at, 0]), int(steps[at, 1])
-        cut = _tile_spectra(first, second, (*corner, side), shift, STACK_REACH, cell)
+        cut = _tile_spectra(first, second, (*corner, side), shifts[at], STACK_REACH, cell)
         return None if cut is None else np.stack(neutral.evidence_of_fields(*cut, 0.5)[0])
 
     with ThreadPoolExecutor(correlate.WORKERS) as several:

@@ -19,6 +19,7 @@ import trimesh
 from test_pipeline import OFFSET, floors, survey
 
 from meshreg import cli
+from meshreg.ties.table import COLUMNS
 
 HALF = 3.5
 NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
@@ -87,17 +88,7 @@ def tie_points(path: Path, off: np.ndarray) -> np.ndarray:
     there = here + OFFSET[:2] + off
     with path.open("w", newline="") as file:
         table = csv.writer(file)
-        table.writerow(
-            [
-                "id",
-                "name",
-                "reference_east",
-                "reference_north",
-                "moving_east",
-                "moving_north",
-                "crs",
-            ]
-        )
+        table.writerow(COLUMNS)
         for k, pair in enumerate(np.hstack([there, here]), 1):
             table.writerow([k, "", *pair, ""])
     return here

@@ -166,7 +166,7 @@ def surface(
     total = np.zeros(counts.shape)
     for field in each:
         total += field
-    evidence = in_deviations(total, scored)
+    evidence = _in_deviations(total, scored)
     return np.where(scored, evidence, np.nan), counts
 
 
@@ -186,7 +186,7 @@ def evidence_of_fields(
         power = np.sqrt(np.maximum(powers[0], 0) * np.maximum(powers[1], 0))
         usable = scored & (power > 1e-6 * np.maximum(power.max(), 1e-300))
         z = np.divide(cross, power, out=np.zeros_like(cross), where=usable) * np.sqrt(counts)
-        each.append(in_deviations(z, usable))
+        each.append(_in_deviations(z, usable))
     return each, counts, scored
 
 
@@ -205,7 +205,7 @@ def turned_grid(grid: Grid, turn: int) -> Grid:
     )
 
 
-def in_deviations(values: Float64, use: Any) -> Float64:
+def _in_deviations(values: Float64, use: Any) -> Float64:
     """Subtract the median and divide by the robust spread of the cells in use."""
     some = (slice(None, None, 2 if values.size > _MANY else 1),) * 2
     known = values[some][use[some]]
