@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import glob
-import importlib
 import logging
 import os
 import shutil
-import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -40,17 +38,6 @@ class SurveyRequest:
     def name(self) -> str:
         """What the log calls it."""
         return self.called or self.path
-
-
-def import_early(*names: str) -> None:
-    """Import modules beside the work, which leaves part of the machine idle at its beginning."""
-
-    def work() -> None:
-        for name in names:
-            with suppress(ImportError):  # the stage that needs it says so
-                importlib.import_module(name)
-
-    threading.Thread(target=work, daemon=True).start()
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,6 @@ from typing import Any
 
 from rich.markup import escape
 
-from meshreg.cli_parts.common import import_early
 from meshreg.cli_parts.console import Progress, Voice
 from meshreg.errors import UsageError
 
@@ -46,7 +45,6 @@ def synth(request: SynthRequest, voice: Voice) -> dict[str, Any]:
     from data_synth.recipe import load
 
     recipe = load(request.scenario, request.changes)
-    import_early("cv2", "scipy.ndimage", "scipy.spatial", "PIL.Image", "meshreg.io", "pyproj")
     with Progress(voice) as progress:
         files = write_pair(
             recipe,

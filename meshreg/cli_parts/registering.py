@@ -15,7 +15,6 @@ from meshreg.cli_parts.common import (
     LOG,
     NewFolder,
     SurveyRequest,
-    import_early,
     named_files,
     new_folder,
     read,
@@ -31,14 +30,6 @@ from meshreg.settings import Settings
 
 if TYPE_CHECKING:
     from meshreg.types import Registration, Survey, Transform
-
-
-_NEEDED = (
-    "cv2", "scipy.fft", "scipy.ndimage", "scipy.spatial", "meshreg.pipeline", "meshreg.report",
-    "meshreg.io.record", "rasterio", "tomli_w", "scipy.sparse.csgraph", "scipy.interpolate",
-    "matplotlib.backends.backend_agg", "matplotlib.figure", "PIL.WebPImagePlugin",
-    "meshreg.io.geotiff_write", "meshreg.io.obj_write", "pyproj.crs",
-)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -84,8 +75,6 @@ def register_into(folder: Path, request: RegisterRequest, progress: Progress) ->
         draughtsman(request.reference.path, request.moving.path) as begin,
         ThreadPoolExecutor(1) as beside,
     ):
-        # not before: cv2 changes sys.path while it is imported, and the new process gets a copy
-        import_early(*_NEEDED)
         clock = time.perf_counter()
         reference, moving, notes = _read_both(request, progress)
         require_apart(request.out, survey_files(reference, moving))
