@@ -281,7 +281,7 @@ def _in_frame(
     if judgement.best is not None and judgement.verdict != "rejected":
         with clock.stage("refine"):
             used = _supporting(judgement, pairs, settings)
-            agree = judging.agree_distance(settings.judge, pairs["dem"][0].grid.cell)
+            agree = judging.agree_distance(settings.judge, pairs["dem"])
             at = judgement.best.east, judgement.best.north
             refined = refine(used, at, judgement.best.sigma, agree, fields)
             contradicted = _against_ties(estimates, refined, motion, settings)

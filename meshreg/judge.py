@@ -23,6 +23,7 @@ from meshreg.settings import JudgeSettings, Settings
 from meshreg.types import Float64, OffsetEstimate, SurveyRaster, Verdict
 
 EXCHANGES = ((True, False), (False, True), (True, True))  # down, across
+_OF_PLOT = 0.05  # of the shorter side: what is further apart is another place on any plot
 TURNS = tuple((turn, flip) for turn in range(4) for flip in (False, True))[1:]
 SCORED_OVERLAP = 0.10  # of the largest: the neutral measure is fair to small overlaps
 EXCHANGED = "with east and north exchanged"
@@ -177,7 +178,7 @@ def judge(
         maps = channel_maps(rasters, radius)
     if not maps:
         return Judgement("rejected", "the surveys do not overlap within the search window", None)
-    reach = agree_distance(settings.judge, rasters["dem"][0].grid.cell)
+    reach = agree_distance(settings.judge, rasters["dem"])
     candidates = _candidates(estimates, maps)
     hypotheses = tuple(
         sorted(_merge(candidates, maps, reach, rivals or {}), key=lambda h: h.score, reverse=True)
@@ -214,9 +215,10 @@ def _flat(reliefs: Sequence[float], limit: float) -> str:
     return " and ".join(flat)
 
 
-def agree_distance(settings: JudgeSettings, dem_cell: float) -> float:
-    """Candidates nearer than this are one: 0.25 m, or 2.5 DEM cells where those are coarser."""
-    return max(settings.agree_distance, 2.5 * dem_cell)
+def agree_distance(settings: JudgeSettings, dem: tuple[SurveyRaster, SurveyRaster]) -> float:
+    """Candidates nearer than this [m] are one: 0.25 m, 1/20 of a smaller plot, or 2.5 DEM cells."""
+    shorter = min(min(raster.grid.shape) * raster.grid.cell for raster in dem)
+    return max(min(settings.agree_distance, _OF_PLOT * shorter), 2.5 * dem[0].grid.cell)
 
 
 def channel_map(

@@ -1,7 +1,7 @@
 """Every number that a user may change: one frozen dataclass a stage, in metres.
 
 `robust` is the default preset; `paper` is Bryson et al. (IROS 2013) as published. Each setting has
-its range beside it (`meshreg.checked`); after a change run `scripts/settings_table`.
+its range beside it (`meshreg.checked`); after a change run `scripts/settings_table.py`.
 """
 
 from __future__ import annotations
@@ -158,7 +158,7 @@ class JudgeSettings(Checked):
 
     section: ClassVar[str] = "judge"
     agree_distance: float = number(
-        0.25, "answers this near agree, or 2.5 DEM cells where more", above=0, high=1000, unit="m"
+        0.25, "answers this near agree; 1/20 of a smaller plot's side, or 2.5 DEM cells where more", above=0, high=1000, unit="m"
     )
     min_overlap: float = number(
         0.25, "of the smaller survey's cells; less goes to review", low=0, high=1

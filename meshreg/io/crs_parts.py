@@ -20,6 +20,9 @@ from meshreg.errors import InputError
 _LOG = logging.getLogger("meshreg")
 _ODM = re.compile(r"WGS\s?84\s+UTM\s+(\d{1,2})\s*([NS])", re.IGNORECASE)
 _DIGITS = re.compile(r"(?:EPSG:{0,2})?\s*(\d{4,6})", re.IGNORECASE)
+_LENGTHS = (1e-3, 2e5)  # of a unit [m]: a millimetre, more than the 150 km of a coarse grid
+_ANGLES = (1e-7, 1.0)  # of a unit [rad]: a tenth of a microradian, the radian
+_BODIES = (1e5, 1e8)  # semi-major axes [m]: of every planet, and of moons that are round
 
 
 def mend_proj_data() -> str | None:
@@ -60,7 +63,7 @@ def parse_crs(value: str) -> Any:
     Raises
     ------
     InputError
-        If PROJ does not know it.
+        If PROJ does not know it, or its units or its ellipsoid cannot be those of a survey.
     """
     mend_proj_data()
     import pyproj
@@ -75,12 +78,37 @@ def parse_crs(value: str) -> Any:
     else:
         text = re.sub(r"^([A-Za-z]+)::(\d+)$", r"\1:\2", text)
     try:
-        return pyproj.CRS.from_user_input(text)
+        crs = pyproj.CRS.from_user_input(text)
     except (pyproj.exceptions.CRSError, pyproj.exceptions.DataDirError) as error:
         raise InputError(
             f"the coordinate reference system {short(value)!r} is not known ({short(error)}).",
             remedy="Give it as EPSG:number or as WKT.",
         ) from error
+    absurd = _absurd(crs)
+    if absurd:
+        raise InputError(
+            f"the coordinate reference system {short(value)!r} cannot be right: {absurd}.",
+            remedy="Give it as EPSG:number, or mend its text.",
+        )
+    return crs
+
+
+def _absurd(crs: Any) -> str:
+    """Say what of a CRS no survey has, a unit or the size of the Earth; or ''."""
+    parts = [unbound(part) for part in (crs.sub_crs_list if crs.is_compound else [crs])]
+    parts += [part.geodetic_crs for part in parts if part.is_projected]
+    for part in parts:
+        for axis in part.axis_info:
+            factor = axis.unit_conversion_factor
+            angle = part.is_geographic and axis.direction in ("north", "south", "east", "west")
+            low, high = _ANGLES if angle else _LENGTHS
+            if not low <= factor <= high:  # also where it is not a number
+                unit = "rad" if angle else "m"
+                return f"the unit {short(axis.unit_name)!r} of its {axis.name} is {factor:g} {unit}"
+    body = crs.ellipsoid
+    if body is not None and not _BODIES[0] <= body.semi_major_metre <= _BODIES[1]:
+        return f"its ellipsoid {short(body.name)!r} has a radius of {body.semi_major_metre:g} m"
+    return ""
 
 
 @lru_cache(maxsize=64)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pyproj
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -15,6 +16,7 @@ from meshreg.types import Frame
 
 CENTRE = (500.0, 400.0, 3.0)  # file coordinates; with the shift they lie in zone 54 south
 SHIFT = (731000.0, 5705000.0, 0.0)
+UTM = pyproj.CRS("EPSG:32754").to_wkt("WKT1_ESRI")
 
 
 @pytest.fixture
@@ -243,6 +245,11 @@ def test_two_crs_that_are_spelled_apart_agree(survey):
         ("coords.txt", "WGS84 UTM 54S\neast north\n", "line 2: expected 2 numbers"),
         ("coords.txt", "WGS84 UTM 99S\n1 2\n", "not known"),
         ("reef.prj", "PROJCS[nonsense", "not known"),
+        ("reef.prj", UTM.replace("0.0174532925199433", "9" * 20), "is 1e.20 rad"),
+        ("reef.prj", UTM.replace("0.0174532925199433", "1e-9"), "is 1e-09 rad"),
+        ("reef.prj", UTM.replace('"Meter",1.0', '"Meter",1e9'), r"unit .* is 1e\+09 m"),
+        ("reef.prj", UTM.replace('"Meter",1.0', '"Meter",1e-9'), "is 1e-09 m"),
+        ("reef.prj", UTM.replace("6378137.0", "6378.137"), "radius of 6378.14 m"),
         ("reef.survey.toml", "shift = [1, 2\n", "not TOML"),
         ("reef.survey.toml", "shift = [1, 2]\n", "expected three numbers"),
         ("reef.survey.toml", "shift = [1, 2, nan]\n", "expected three numbers"),
