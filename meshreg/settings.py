@@ -158,7 +158,11 @@ class JudgeSettings(Checked):
 
     section: ClassVar[str] = "judge"
     agree_distance: float = number(
-        0.25, "answers this near agree; 1/20 of a smaller plot's side, or 2.5 DEM cells where more", above=0, high=1000, unit="m"
+        0.25,
+        "answers this near agree; 1/20 of a smaller plot's side, or 2.5 DEM cells where more",
+        above=0,
+        high=1000,
+        unit="m",
     )
     min_overlap: float = number(
         0.25, "of the smaller survey's cells; less goes to review", low=0, high=1

@@ -10,11 +10,11 @@ import pytest
 import seafloor
 from scipy import ndimage
 
-from meshreg.judge import TURN_NAMES, channel_map, judge, relief_of
+from meshreg.judge import TURN_NAMES, agree_distance, channel_map, judge, relief_of
 from meshreg.offsets import estimate_offsets
 from meshreg.offsets.neutral import fields
 from meshreg.settings import Settings
-from meshreg.types import OffsetEstimate, SurveyRaster
+from meshreg.types import Grid, OffsetEstimate, SurveyRaster
 
 OFFSET = (1.237, -2.412)
 SETTINGS = Settings().changed({"methods": "terrain,mutual_information", "search.radius": 5.0})
@@ -238,3 +238,18 @@ def test_chance_is_measured_without_the_true_match():
             assert found.peak.gap > 10
             assert len(found.exchanged) == 3
             assert max(found.exchanged) < 3
+
+
+@pytest.mark.parametrize(
+    ("half", "cell", "expected"),
+    [(7.0, 0.1, 0.25), (0.25, 0.002, 0.025), (0.25, 0.02, 0.05), (300.0, 1.0, 2.5)],
+    ids=["reef", "quadrat", "coarse quadrat", "beach"],
+)
+def test_on_a_small_plot_places_that_agree_lie_nearer(half, cell, expected):
+    """A quarter of a metre is half of a quadrat of 0.5 m."""
+    flat = np.zeros((round(2 * half / cell), round(3 * half / cell)), np.float32)
+    one = SurveyRaster(
+        Grid(0.0, 0.0, cell, flat.shape, None), flat, np.zeros((*flat.shape, 3), np.uint8),
+        np.ones(flat.shape, bool), np.ones(flat.shape, bool), np.ones(flat.shape, np.uint16),
+    )  # fmt: skip
+    assert agree_distance(Settings().judge, (one, one)) == pytest.approx(expected)

@@ -20,6 +20,7 @@ from meshreg.io.geotiff_sides import MAGIC, Sides
 from meshreg.io.safe import FARTHEST, beside, open_regular, require_proportion
 from meshreg.types import Float64
 
+_CACHE = 64  # MB; a twentieth of the memory else, filled by any large raster
 _WINDOW = 1 << 22  # pixels decoded at once
 _PER_PIXEL = 64  # bytes of memory: values, what is valid, both sampled anew, rasters of them
 ANY_SIZE = 1 << 62  # `max_pixels` for files that we wrote, or have read before
@@ -34,7 +35,9 @@ def environment() -> Iterator[None]:
     mend_proj_data()
     import rasterio
 
-    with rasterio.Env(GDAL_DISABLE_READDIR_ON_OPEN="EMPTY_DIR", GDAL_PAM_ENABLED="NO"):
+    with rasterio.Env(
+        GDAL_DISABLE_READDIR_ON_OPEN="EMPTY_DIR", GDAL_PAM_ENABLED="NO", GDAL_CACHEMAX=_CACHE
+    ):
         yield
 
 

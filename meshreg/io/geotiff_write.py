@@ -19,6 +19,7 @@ from meshreg.types import Bool, Float32, Grid, UInt8
 log = logging.getLogger("meshreg")
 
 NODATA = -9999.0
+_TILE = 512  # cells, as in a cloud-optimised GeoTIFF
 _RETURN = "Check free space and run again."
 
 
@@ -39,10 +40,9 @@ def write_height(
     OutputError
         It could not be written, or did not read back as written.
     """
-    values = np.where(np.isfinite(height), height, np.float32(NODATA)).astype(np.float32)
     if (height == NODATA).any():
         log.warning("%s: heights of exactly %g become no data.", path, NODATA)
-    _write(values[None], grid, path, nodata=NODATA, units="metre", local=local, tags=tags)
+    _write(height[None], grid, path, nodata=NODATA, units="metre", local=local, tags=tags)
 
 
 def write_color(
@@ -87,6 +87,7 @@ def _write(
         from rasterio.enums import ColorInterp
         from rasterio.errors import RasterioError
         from rasterio.io import MemoryFile
+        from rasterio.shutil import copy
 
         crs = None if grid.crs is None else CRS.from_wkt(parse_crs(grid.crs).to_wkt())
         if crs is None and local is not None:
@@ -94,9 +95,9 @@ def _write(
         # GDAL writes some blocks while it closes a file, and a full disk is then no error to it.
         # In its memory there is none, and what Python writes fails where it fails.
         try:
-            with MemoryFile(ext=".tif") as memory:
-                with memory.open(
-                    driver="COG",
+            with MemoryFile(ext=".tif") as plain, MemoryFile(ext=".tif") as memory:
+                with plain.open(
+                    driver="GTiff",
                     width=grid.shape[1],
                     height=grid.shape[0],
                     count=len(bands),
@@ -104,12 +105,14 @@ def _write(
                     crs=crs,
                     transform=Affine(grid.cell, 0, grid.west, 0, -grid.cell, grid.north),
                     nodata=nodata,
-                    compress="DEFLATE",
-                    predictor="YES",
+                    tiled=True,
+                    blockxsize=_TILE,
+                    blockysize=_TILE,
+                    sparse_ok=True,  # a turned strip is mostly empty
                     bigtiff="IF_SAFER",
-                    overview_resampling="AVERAGE",
                 ) as dataset:
-                    dataset.write(bands)
+                    for _, window in dataset.block_windows():
+                        dataset.write(_cut(bands, window, nodata), window=window)
                     dataset.update_tags(**(tags or {}))
                     dataset.update_tags(
                         AREA_OR_POINT="Area", TIFFTAG_SOFTWARE=f"meshreg {__version__}"
@@ -123,20 +126,37 @@ def _write(
                         ]
                     if units:
                         dataset.units = (units,) * len(bands)
+                copy(
+                    plain.name,
+                    memory.name,
+                    driver="COG",
+                    compress="DEFLATE",
+                    predictor="YES",
+                    bigtiff="IF_SAFER",
+                    overview_resampling="AVERAGE",
+                )
                 temporary.write_bytes(memory.getbuffer())
         except RasterioError as error:
             raise OutputError(f"cannot be written: {error}.", file=path, remedy=_RETURN) from error
-        _check(bands, grid, temporary, path)
+        _check(bands, grid, temporary, path, nodata)
 
 
-def _check(bands: NDArray[Any], grid: Grid, temporary: Path, path: Path) -> None:
+def _cut(bands: NDArray[Any], window: Any, nodata: float | None) -> NDArray[Any]:
+    """Return a window of the bands as it is in the file: what is not a number is no data there."""
+    cut = bands[(slice(None), *window.toslices())]
+    return cut if nodata is None else np.where(np.isfinite(cut), cut, cut.dtype.type(nodata))
+
+
+def _check(
+    bands: NDArray[Any], grid: Grid, temporary: Path, path: Path, nodata: float | None
+) -> None:
     """Compare what is on disk with what was meant, value by value."""
     try:
         with opened(temporary, 1 << 62) as dataset:
             same = dataset.shape == grid.shape and dataset.bounds == grid.bounds
             for window in windows(dataset) if same else ():
-                rows = slice(window.row_off, window.row_off + window.height)
-                same = same and np.array_equal(dataset.read(window=window), bands[:, rows])
+                there = dataset.read(window=window)
+                same = same and np.array_equal(there, _cut(bands, window, nodata))
     except InputError as error:
         raise OutputError(error.message, file=path, remedy=_RETURN) from error
     if not (same and _tags_agree(grid, temporary)):

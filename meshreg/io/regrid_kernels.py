@@ -39,6 +39,30 @@ def _bilinear(
     return total / weight, True
 
 
+@jit(nogil=True)
+def _between(nodes: Any, row: int, col: int, down: float) -> tuple[float, float, float]:
+    """Return file x, y and absolute up between two rows of nodes."""
+    upper, lower = nodes[row, col], nodes[row + 1, col]
+    return (
+        upper[0] * (1 - down) + lower[0] * down,
+        upper[1] * (1 - down) + lower[1] * down,
+        upper[2] * (1 - down) + lower[2] * down,
+    )
+
+
+@jit(nogil=True)
+def _misses(
+    back: Any, shape: tuple[int, int], start: tuple[float, ...], end: tuple[float, ...]
+) -> bool:
+    """Whether the line between two places in the file, x, y, passes a raster on one side."""
+    for axis, size in ((0, shape[1]), (1, shape[0])):
+        one = back[axis, 0] * start[0] + back[axis, 1] * start[1] + back[axis, 2]
+        two = back[axis, 0] * end[0] + back[axis, 1] * end[1] + back[axis, 2]
+        if max(one, two) < -1.0 or min(one, two) > size + 1.0:
+            return True
+    return False
+
+
 @jit(parallel=True, nogil=True)
 def resample(
     values: Any,
@@ -71,37 +95,41 @@ def resample(
     for row in prange(rows):
         node_row = row // step
         down = (row - node_row * step) / step
-        for col in range(cols):
-            node_col = col // step
-            right = (col - node_col * step) / step
-            place = np.zeros(3)
-            for k in range(3):
-                upper = nodes[node_row, node_col, k] * (1 - right)
-                upper += nodes[node_row, node_col + 1, k] * right
-                lower = nodes[node_row + 1, node_col, k] * (1 - right)
-                lower += nodes[node_row + 1, node_col + 1, k] * right
-                place[k] = upper * (1 - down) + lower * down
-            x, y = place[0], place[1]
-            height = level
-            if surface.shape[0] > 0:
-                for _ in range(3):  # a contraction by tilt times slope
-                    lift = height - level
-                    found, known = _bilinear(
-                        surface,
-                        surface_valid,
-                        surface_back,
-                        x + lean[0] * lift,
-                        y + lean[1] * lift,
-                        0,
-                    )
-                    if known:
-                        height = found
-                x += lean[0] * (height - level)
-                y += lean[1] * (height - level)
-            for k in range(channels):
-                value, ok = _bilinear(values, valid, back, x, y, k)
-                seen[row, col] = ok
-                if is_height:
-                    out[row, col, k] = place[2] + gain * (value - level) if ok else np.nan
-                else:
-                    out[row, col, k] = np.rint(value)
+        for node_col in range((cols - 1) // step + 1):
+            start = _between(nodes, node_row, node_col, down)
+            end = _between(nodes, node_row, node_col + 1, down)
+            first, last = node_col * step, min((node_col + 1) * step, cols)
+            if surface.shape[0] == 0 and _misses(back, valid.shape, start, end):
+                for col in range(first, last):
+                    seen[row, col] = False
+                    for k in range(channels):
+                        out[row, col, k] = np.nan if is_height else 0
+                continue
+            for col in range(first, last):
+                right = (col - first) / step
+                x = start[0] * (1 - right) + end[0] * right
+                y = start[1] * (1 - right) + end[1] * right
+                up = start[2] * (1 - right) + end[2] * right
+                height = level
+                if surface.shape[0] > 0:
+                    for _ in range(3):  # a contraction by tilt times slope
+                        lift = height - level
+                        found, known = _bilinear(
+                            surface,
+                            surface_valid,
+                            surface_back,
+                            x + lean[0] * lift,
+                            y + lean[1] * lift,
+                            0,
+                        )
+                        if known:
+                            height = found
+                    x += lean[0] * (height - level)
+                    y += lean[1] * (height - level)
+                for k in range(channels):
+                    value, ok = _bilinear(values, valid, back, x, y, k)
+                    seen[row, col] = ok
+                    if is_height:
+                        out[row, col, k] = up + gain * (value - level) if ok else np.nan
+                    else:
+                        out[row, col, k] = np.rint(value)

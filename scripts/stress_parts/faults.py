@@ -215,7 +215,10 @@ class Painted:
 
         picture = np.full((1000, 2000, 3), 255, np.uint8)
         picture[300:700, 400:1600] = 90
+        limit = resource.getrlimit(resource.RLIMIT_FSIZE)  # of another process
+        resource.setrlimit(resource.RLIMIT_FSIZE, (limit[1], limit[1]))
         np.save(json.loads(asked)[1], picture)
+        resource.setrlimit(resource.RLIMIT_FSIZE, limit)
         return "", ""
 
 
@@ -408,7 +411,9 @@ def _faulty(bench: Bench, command: list[str], fault: str, k: int, limit: int) ->
     if fault == LARGE:
         return bench.run(
             command,
-            prepare=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit)),
+            prepare=lambda: resource.setrlimit(
+                resource.RLIMIT_FSIZE, (limit, resource.RLIM_INFINITY)
+            ),
         )
     return bench.run(command, prepare=_no_look_at_the_disk)
 
