@@ -72,7 +72,7 @@ def far_pose(
         )
     if abs(math.log(scale)) > math.log1p(search.max_scale) + 0.5 * math.log(RATIO):
         return (
-            f"the moving survey is about {1 / scale:.2g} times as large as the reference, further "
+            f"the moving survey is about {1 / scale:.2f} times as large as the reference, further "
             "off than is searched: check the units (--unit) and the scale"
         )
     return ""

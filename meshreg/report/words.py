@@ -86,7 +86,7 @@ _ADVICE: tuple[tuple[str, tuple[str, ...]], ...] = (
         ),
     ),
     (
-        r"too (small|large)",
+        r"too (small|large)|times as large",
         (
             "The lengths of the surveys differ. Check the scale bars or camera positions of the "
             "model that is wrong, and make it again; growth does not stretch the ground.",
