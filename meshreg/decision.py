@@ -43,7 +43,7 @@ from meshreg.types import (
     Transform,
 )
 from meshreg.verdict import Found, Stretch, findings, last_word
-from meshreg.voting import PLAIN_SCALE, STANDS_OUT, Turn, vote
+from meshreg.voting import PLAIN_SCALE, STANDS_OUT, Turn, not_voted, vote
 
 log = logging.getLogger(__name__)
 Progress = Callable[[str, float], None]
@@ -156,6 +156,23 @@ def _asked(
     manual: Manual | None,
     turned: Turned | None,
     beyond: Elsewhere = NOWHERE,
+) -> Decision:
+    """Decide; where nothing was proven, say which cells no turn was searched for on."""
+    decision = _turned_if_voted(pairs, settings, radius, clock, manual, turned, beyond)
+    said = not_voted(pairs, settings.search, radius)
+    if not said or decision.motion is not None or decision.judgement.verdict == "accepted":
+        return decision
+    return dataclasses.replace(decision, notes=(*decision.notes, said))
+
+
+def _turned_if_voted(
+    pairs: Pairs,
+    settings: Settings,
+    radius: float,
+    clock: Clock,
+    manual: Manual | None,
+    turned: Turned | None,
+    beyond: Elsewhere,
 ) -> Decision:
     """Turn the moving survey if its tiles ask for it; then estimate, judge and refine."""
     turn = None

@@ -161,6 +161,20 @@ def vote(pairs: Mapping[str, Pair], settings: SearchSettings, radius: float) -> 
     return scaled(best, settings)
 
 
+def not_voted(pairs: Mapping[str, Pair], settings: SearchSettings, radius: float) -> str:
+    """Say that `vote` left out the DEM's own cells, as their surfaces are too large; '' if not."""
+    turn = float(np.deg2rad(settings.max_yaw)) + settings.max_scale
+    laid, _, half = _laid_together(pairs, radius)
+    finest, cell = _voting_cells(laid, half, turn)[-1], laid["dem"][1].grid.cell
+    if turn <= 0 or finest < 1.5 * cell:
+        return ""
+    needed = surfaces_bytes(laid["dem"][1], cell, half, turn) / 1e9
+    return (
+        f"turns and scales were searched for on cells of {finest:.3g} m and coarser: those of the "
+        f"DEM, {cell:.3g} m, would need {needed:.3g} GB within the search radius of {radius:g} m"
+    )
+
+
 def _inside(turn: Turn, settings: SearchSettings) -> bool:
     """Whether a turn is one of those that were asked for."""
     most = np.deg2rad(settings.max_yaw) + SMALL_YAW, settings.max_scale + PLAIN_SCALE

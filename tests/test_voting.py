@@ -12,15 +12,24 @@ import seafloor
 
 from data_synth.rasters import make_rasters
 from data_synth.recipe import load
-from meshreg import Mesh, Settings, Survey, apply_transform, decision, heading, register_pair
+from meshreg import (
+    Mesh,
+    Settings,
+    Survey,
+    apply_transform,
+    decision,
+    heading,
+    register_pair,
+    voting,
+)
 from meshreg.benchmark.measure import register_rasters
 from meshreg.judge import judge
 from meshreg.raster.grid import coarsened
 from meshreg.settings import SearchSettings
 from meshreg.statistics import registration_sigma
-from meshreg.tile_surfaces import channel_surfaces
+from meshreg.tile_surfaces import channel_surfaces, surfaces_bytes
 from meshreg.types import Grid, SurveyRaster, Transform
-from meshreg.voting import STANDS_OUT, similarity, vote
+from meshreg.voting import STANDS_OUT, not_voted, similarity, vote
 from meshreg.voting_kernels import BIAS, SCORED, strongest
 
 OFFSET = np.array([1.337, -2.412, 0.083])
@@ -347,6 +356,20 @@ def test_a_long_beach_votes_on_its_own_cells(yaw_deg, scale):
     # a tile that is turned runs off its peak; a turned survey is measured anew once it is straight
     assert turn.stretch == pytest.approx(1 / scale, abs=0.01 if yaw_deg else 0.002)
     assert turn.scale == (turn.stretch if scale != 1 else 1.0)
+
+
+def test_cells_that_would_need_too_much_memory_are_not_voted_on_and_that_is_said(monkeypatch):
+    pairs = strip(5.0, 1.0)
+    assert not_voted(pairs, SEARCH, 40.0) == ""
+    per_cell = surfaces_bytes(pairs["dem"][1], 1.0, 40.0, math.radians(8.0) + SEARCH.max_scale)
+    monkeypatch.setattr(voting, "MOST_BYTES", 0.99 * per_cell)
+    said = not_voted(pairs, SEARCH, 40.0)
+    assert "cells of 2 m and coarser" in said
+    assert f"the DEM, 1 m, would need {per_cell / 1e9:.3g} GB" in said
+    assert not_voted(pairs, SearchSettings(max_yaw=0.0, max_scale=0.0), 40.0) == ""
+    lost = decision.decide(pairs, QUICK.changed({"search.radius": 40.0}), 40.0)
+    assert lost.judgement.verdict != "accepted"
+    assert said in lost.notes
 
 
 @pytest.mark.parametrize(("yaw", "scale"), [(0.05, 1.0), (0.0, 0.975)])
