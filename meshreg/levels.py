@@ -64,22 +64,37 @@ def lay_down(
 ) -> dict[str, Any]:
     """Lay both surveys on common grids, which hold the moving one before and after.
 
-    What SIFT looks at is not needed any more: cells are as large as the orthomosaic's.
+    One that was delivered wholly beside the reference and its own registered place would make them
+    as large as the way between: it stays on its own grid, as "moving_…_apart". What SIFT looks at
+    is not needed any more: cells are as large as the orthomosaic's.
     """
     rasters: dict[str, Any] = {}
     kept = {name: pairs[name] for name in ("dem", "ortho")}
-    grids = {name: common_grid(a.grid, b.grid) for name, (a, b) in kept.items()}
+    grids = {name: still.grid for name, (still, _) in kept.items()}
+    apart = False
     if transform is not None:
         cells = _cells(settings)
         there = survey_grids(moving, cells, _lattice(cells), transform=transform)
         grids = {name: common_grid(grid, there[name]) for name, grid in grids.items()}
-    for name in kept:
-        rasters[f"reference_{name}"] = statistics.on_grid(pairs[name][0], grids[name])
-        rasters[f"moving_{name}_before"] = statistics.on_grid(pairs[name][1], grids[name])
+        apart = _beside(kept["dem"][1].grid, grids["dem"])
+    if not apart:
+        grids = {name: common_grid(grids[name], b.grid) for name, (_, b) in kept.items()}
+    for name, (still, delivered) in kept.items():
+        rasters[f"reference_{name}"] = statistics.on_grid(still, grids[name])
+        if apart:
+            rasters[f"moving_{name}_apart"] = delivered
+        else:
+            rasters[f"moving_{name}_before"] = statistics.on_grid(delivered, grids[name])
     if transform is None:
         return rasters
     moved = _levels(moving, grids, settings, masks["moving"], transform)
     return rasters | {"moving_dem": moved["dem"], "moving_ortho": moved["ortho"]}
+
+
+def _beside(one: Grid, other: Grid) -> bool:
+    """Whether two grids share no cell."""
+    (w, s, e, n), (west, south, east, north) = one.bounds, other.bounds
+    return w >= east or e <= west or s >= north or n <= south
 
 
 def _levels(

@@ -172,7 +172,9 @@ def register_pair(  # noqa: PLR0913
             rasters["moving_dem_before"],
             rasters["reference_ortho"],
             rasters["moving_ortho_before"],
-        ),
+        )
+        if "moving_dem_before" in rasters
+        else dict(statistics.APART),
         after={}
         if transform is None
         else statistics.compare(

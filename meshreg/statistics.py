@@ -131,6 +131,16 @@ def nmad(values: Float64) -> float:
     return MAD_TO_SIGMA * float(np.median(np.abs(values - np.median(values))))
 
 
+APART: dict[str, Any] = {  # of surveys that lie beside each other
+    "overlap": 0.0,
+    "cells": 0,
+    "height_median": None,
+    "height_nmad": None,
+    "height_rmse": None,
+    "image_similarity": None,
+}
+
+
 def compare(
     reference_dem: SurveyRaster,
     moving_dem: SurveyRaster,
@@ -145,12 +155,9 @@ def compare(
     difference = height_difference(reference_dem, moving_dem)
     known = difference[np.isfinite(difference)]
     smaller = min(int(reference_dem.valid.sum()), int(moving_dem.valid.sum()))
-    result: dict[str, Any] = {
+    result: dict[str, Any] = APART | {
         "overlap": known.size / smaller if smaller else 0.0,
         "cells": int(known.size),
-        "height_median": None,
-        "height_nmad": None,
-        "height_rmse": None,
         "image_similarity": _image_similarity(reference_ortho, moving_ortho),
     }
     if known.size:

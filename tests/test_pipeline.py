@@ -13,7 +13,9 @@ import seafloor
 from meshreg import Mesh, PointCloud, Settings, Survey, apply_transform, register_pair
 from meshreg.errors import UsageError
 from meshreg.heights import STABLE, rotation
-from meshreg.statistics import registration_sigma
+from meshreg.io.evidence import read_evidence, write_evidence
+from meshreg.report import keep
+from meshreg.statistics import APART, registration_sigma
 from meshreg.surfaces import Polished
 from meshreg.types import Transform
 
@@ -192,6 +194,35 @@ def test_evidence_for_the_report_is_on_common_grids():
     after = pair[0].height + pair[0].datum - pair[1].height - pair[1].datum
     assert abs(np.median(after[both])) < 0.005
     assert np.percentile(np.abs(after[both]), 50) < 0.02
+
+
+def test_maps_do_not_hold_the_way_between_a_far_survey_and_its_place(tmp_path):
+    """Delivered 60 m off: cells of the way between cost what the survey itself does not."""
+    first, later = floors()
+    away = np.array([-48.0, 37.0, 0.0])
+    moving = dataclasses.replace(survey(later, half=3.0, seed=3), origin=away)
+    registration = register_pair(
+        survey(first, half=5.0), moving, QUICK.changed({"search.radius": 70.0})
+    )
+    assert registration.verdict == "accepted"
+    np.testing.assert_allclose(registration.transform.offset, -away, atol=0.01)
+    evidence = registration.evidence
+    for kind in ("dem", "ortho"):
+        reference, after = (evidence[f"{which}_{kind}"] for which in ("reference", "moving"))
+        assert f"moving_{kind}_before" not in evidence
+        assert reference.grid == after.grid
+        np.testing.assert_allclose(reference.grid.bounds, [-5, -5, 5, 5], atol=0.2)
+        apart = evidence[f"moving_{kind}_apart"]
+        np.testing.assert_allclose(apart.grid.bounds, [-51, 34, -45, 40], atol=0.2)
+        assert after.valid.sum() == pytest.approx(apart.valid.sum(), rel=0.01)
+    assert registration.before == APART
+    assert registration.before.keys() == registration.after.keys()
+    write_evidence(keep(registration), tmp_path)
+    kept = read_evidence(tmp_path)
+    np.testing.assert_allclose(kept["meta"]["apart"]["bounds"], [-51, 34, -45, 40], atol=0.2)
+    low, high = np.percentile(kept["matches"][kept["matches"][:, 4] > 0, 2], [1, 99])
+    assert -51 < low < high < -45
+    assert kept["matches"][:, 2].mean() - kept["matches"][:, 0].mean() == pytest.approx(-48, abs=1)
 
 
 def test_surveys_kilometres_apart_are_rejected_without_rasterizing_the_sea_between():

@@ -751,10 +751,22 @@ def test_offsets_chart_is_true_to_scale() -> None:
 def test_match_lines_end_where_the_features_lie() -> None:
     ends = np.array([[100.0, 50.0, 110.0, 40.0, 1.0], [120.0, 60.0, 100.0, 50.0, 0.0]])
     empty = np.zeros(4, np.uint8)
-    svg = charts.matches(ends, (empty, empty), (100.0, 30.0, 145.0, 60.0))
+    svg = charts.matches(ends, (empty, empty), ((100.0, 30.0, 145.0, 60.0),) * 2)
     paths = dict(re.findall(r'<path class="(inlier|outlier)" d="([^"]*)"', svg))
     # 10 units a metre, the second picture 470 units to the right
     assert paths == {"inlier": "M0.0 100.0L570.0 200.0", "outlier": "M200.0 0.0L470.0 100.0"}
+
+
+def test_match_lines_of_a_survey_delivered_elsewhere_end_on_its_own_map() -> None:
+    ends = np.array([[100.0, 50.0, 710.0, 840.0, 1.0]])
+    bounds = (100.0, 30.0, 145.0, 60.0), (700.0, 830.0, 722.5, 850.0)
+    svg = charts.matches(ends, (np.zeros(4, np.uint8),) * 2, bounds)
+    # the scale of the wider one, 10 units a metre, for both; each from its own northwest corner
+    assert re.findall(r'd="(M[^"]*)"', svg) == ["M0.0 100.0L570.0 100.0"]
+    assert re.findall(r'width="([\d.]+)" height="([\d.]+)"', svg) == [
+        ("450.0", "300.00"),
+        ("225.0", "200.00"),
+    ]
 
 
 def test_residual_arrows_point_where_the_tiles_should_go() -> None:

@@ -26,13 +26,17 @@ def add_report(registration: Registration, folder: Path) -> None:
     OutputError
         If the files cannot be written.
     """
+    missing = "evidence.npz and report.html were"
     try:
         keep_evidence(registration, folder)
+        missing = "report.html was"
         write_report(folder)
     except MeshregError:
         raise
     except Exception as error:
-        LOG.warning("report.html was not made: %s: %s", type(error).__name__, error)
+        memory = isinstance(error, MemoryError)
+        why = "not enough memory" if memory else f"{type(error).__name__}: {error}"
+        LOG.warning("%s not made: %s", missing, why)
         LOG.debug("why", exc_info=True)
 
 

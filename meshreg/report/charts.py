@@ -132,17 +132,20 @@ def histogram(counts: Any, edges: Any, median: float | None, nmad: float | None)
     return frame.picture(body, "Histogram of the height differences")
 
 
-def matches(ends: Any, pictures: tuple[Any, Any], bounds: Sequence[float]) -> str:
+def matches(
+    ends: Any, pictures: tuple[Any, Any], bounds: tuple[Sequence[float], Sequence[float]]
+) -> str:
     """Both orthomosaics side by side, a line per match: inliers green, outliers red."""
-    west, south, east, north = bounds
-    wide = 450.0
-    scale = wide / (east - west)
-    tall, gap = (north - south) * scale, 20.0
+    west, south, east, north = np.array(bounds, float).T
+    wide, gap = 450.0, 20.0
+    scale = wide / float((east - west).max())  # one for both
+    across, down = (east - west) * scale, (north - south) * scale
+    tall = float(down.max())
     body = ""
     for k, picture in enumerate(pictures):
         body += (
             f'<image class="shade" href="{data_uri(picture)}" x="{k * (wide + gap):.1f}" y="0" '
-            f'width="{wide:.1f}" height="{tall:.2f}" preserveAspectRatio="none"/>'
+            f'width="{across[k]:.1f}" height="{down[k]:.2f}" preserveAspectRatio="none"/>'
         )
     ends = np.asarray(ends, float)
     x = (ends[:, [0, 2]] - west) * scale + [0.0, wide + gap]

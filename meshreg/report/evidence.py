@@ -17,7 +17,8 @@ def draw_matches(registration: Registration) -> Any:
     """Draw matches of image features: both orthomosaics side by side, a line per match."""
     found = [e for e in registration.estimates if "reference_points" in e.evidence]
     reference = registration.evidence.get("reference_ortho")
-    moving = registration.evidence.get("moving_ortho_before")
+    kept = registration.evidence
+    moving = kept.get("moving_ortho_before", kept.get("moving_ortho_apart"))
     if not found or reference is None or moving is None:
         return None
     matches = found[0].evidence
@@ -25,8 +26,8 @@ def draw_matches(registration: Registration) -> Any:
     if inliers.size == 0:
         return None
     color, grid = style.reduced_color(reference)
-    moved, _ = style.reduced_color(moving)
-    place = style.Place(grid)
+    moved, own = style.reduced_color(moving)
+    places = style.Place(grid), style.Place(own)
     tall = style.panel_size(grid, 5.0, 6.5)
     share = inliers.mean()
     figure = style.new_figure(
@@ -36,20 +37,23 @@ def draw_matches(registration: Registration) -> Any:
         f"green: agree    red, thin: outliers    at most {MAX_MATCHES} of each drawn",
     )
     left, right = figure.add_subplot(1, 2, 1), figure.add_subplot(1, 2, 2)
-    pairs = (("reference", left, color), ("moving, as delivered", right, moved))
-    for index, (name, axes, picture) in enumerate(pairs):
+    pairs = (("reference", left, color, grid), ("moving, as delivered", right, moved, own))
+    for place, (name, axes, picture, shown) in zip(places, pairs, strict=True):
         faded = 0.45 + 0.55 * np.nan_to_num(picture, nan=1.0)
-        axes.imshow(style.over_white(faded), extent=place.extent(grid), interpolation="nearest")
+        axes.imshow(style.over_white(faded), extent=place.extent(shown), interpolation="nearest")
         axes.set_title(name, fontsize=10)
-        place.label(axes, inner=index > 0)
+        place.label(axes, inner=axes is right and own == grid)
         axes.set_autoscale_on(False)
     right.tick_params(labelleft=False)  # the matches would cross them
+    if own != grid:  # delivered elsewhere: its own north, on the other side
+        right.yaxis.tick_right()
+        right.yaxis.set_label_position("right")
     figure.draw_without_rendering()  # lines from axes to axes need both in their places
     figure.set_layout_engine("none")
-    corner = np.array([place.east, place.north])
+    corners = [np.array([place.east, place.north]) for place in places]
     ends = (
-        np.asarray(matches["reference_points"], float) - corner,
-        stated.delivered(matches["moving_points"], registration.evidence.get("motion")) - corner,
+        np.asarray(matches["reference_points"], float) - corners[0],
+        stated.delivered(matches["moving_points"], kept.get("motion")) - corners[1],
     )
     _lines(figure, (left, right), ends, ~inliers, color=style.BAD, linewidth=0.3, alpha=0.35)
     _lines(figure, (left, right), ends, inliers, color=style.GOOD, linewidth=0.7, alpha=0.8)

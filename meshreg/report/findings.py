@@ -185,7 +185,8 @@ def _matches(kept: Mapping[str, Any]) -> str:
     if "matches" not in kept or "small_before" not in kept:
         return ""
     both = kept["small_reference"], kept["small_before"]
-    drawn = charts.matches(kept["matches"], both, meta["ortho"]["bounds"])
+    bounds = meta["ortho"]["bounds"], meta.get("apart", meta["ortho"])["bounds"]
+    drawn = charts.matches(kept["matches"], both, bounds)
     inliers, total = (int(meta["matches"][name]) for name in ("inliers", "total"))
     share = number(inliers / total if total else 0, ".1%")
     boxes = (

@@ -89,6 +89,9 @@ def _keep_orthos(evidence: Mapping[str, Any], kept: Kept, meta: dict[str, Any]) 
         if stage != "after":  # the ground under the lines of the matches
             small = pictures.shrunk(raster, MATCH_SIDE)
             kept[f"small_{stage}"] = pictures.encoded(small, SMALL)
+    if (apart := evidence.get("moving_ortho_apart")) is not None:
+        meta["apart"] = _map(apart.grid)
+        kept["small_before"] = pictures.encoded(pictures.shrunk(apart, MATCH_SIDE), SMALL)
 
 
 def _keep_relief(evidence: Mapping[str, Any], kept: Kept, meta: dict[str, Any]) -> None:

@@ -443,10 +443,14 @@ def _wrong(
         allowed.add(5)
     if ended.code not in allowed:
         return f"exit code {ended.code}"
-    page = fault == MEMORY and ended.code == usual.code and "report.html was not made" in said
-    if page and state == "lost" and beside.endswith("not new: out/report.html"):
-        beside = beside.removesuffix("not new: out/report.html").strip()
-        return f"left beside: {beside}" if beside else ""  # a page is no reason to lose a result
+    for what in ("report.html was", "evidence.npz and report.html were"):
+        left_out = "not new: " + " ".join(
+            f"out/{name}" for name in what.split() if name.endswith((".npz", ".html"))
+        )
+        named = fault == MEMORY and ended.code == usual.code and f"{what} not made" in said
+        if named and state == "lost" and beside.endswith(left_out):
+            beside = beside.removesuffix(left_out).strip()  # a page is no reason to lose a result
+            return f"left beside: {beside}" if beside else ""
     if state == "lost":
         return f"neither the old result nor the new one: {beside}"
     if beside:
