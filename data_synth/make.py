@@ -20,7 +20,7 @@ from data_synth.seeing import Lattice
 from data_synth.truth import make_truth
 from meshreg.errors import UsageError
 from meshreg.io.atomic import as_output_error, atomic_folder
-from meshreg.types import Survey
+from meshreg.records import Survey
 
 Progress = Callable[[str, float], None]
 FORMATS = {

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from data_synth import types as t
 from data_synth.scene import Take, View
 from data_synth.seafloor import Seafloor
-from meshreg.types import Mesh, PointCloud, Texture
+from meshreg.records import Mesh, PointCloud, Texture
 
 Float64 = NDArray[np.float64]
 Int32 = NDArray[np.int32]

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from meshreg.errors import OutputError
-from meshreg.types import Texture
+from meshreg.records import Texture
 
 QUALITY = 92
 

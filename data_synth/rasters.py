@@ -13,7 +13,7 @@ from data_synth.recipe import Recipe
 from data_synth.scene import Scene, Take, make_scene
 from data_synth.seeing import Lattice
 from data_synth.truth import make_truth
-from meshreg.types import Grid, SurveyRaster
+from meshreg.records import Grid, SurveyRaster
 
 Float64 = NDArray[np.float64]
 

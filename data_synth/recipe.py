@@ -12,9 +12,9 @@ from data_synth.change import Change
 from data_synth.seafloor import SITES, Site
 from data_synth.seeing import Seeing
 from data_synth.sfm import Sfm
-from meshreg.checked import parse_toml, read_toml, shown
 from meshreg.errors import UsageError
 from meshreg.settings import Settings
+from meshreg.settings.checked import parse_toml, read_toml, shown
 
 LARGEST = 1e9  # of any number of a recipe
 RANGES = {

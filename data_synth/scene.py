@@ -15,8 +15,8 @@ from data_synth.recipe import Recipe
 from data_synth.seafloor import Bounds, Seafloor, make_seafloor
 from data_synth.seeing import Lattice, Plan, Seeing, make_plan, see
 from data_synth.sfm import Distortion, Sfm, identity, make_distortion
-from meshreg.checked import shown
 from meshreg.errors import UsageError
+from meshreg.settings.checked import shown
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]

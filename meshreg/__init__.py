@@ -17,22 +17,22 @@ _HOMES = {
     "estimate_offset": "meshreg.offsets",
     "estimate_offsets": "meshreg.offsets",
     "register_pair": "meshreg.pipeline",
-    "self_test": "meshreg.selftest",
+    "self_test": "meshreg.pipeline",
     "apply_transform": "meshreg.apply",
     "write_survey": "meshreg.io",
     "write_registration": "meshreg.io",
     "read_registration": "meshreg.io",
     "Settings": "meshreg.settings",
-    "Survey": "meshreg.types",
-    "Mesh": "meshreg.types",
-    "PointCloud": "meshreg.types",
-    "Maps": "meshreg.types",
-    "Grid": "meshreg.types",
-    "SurveyRaster": "meshreg.types",
-    "Transform": "meshreg.types",
-    "Warp": "meshreg.types",
-    "OffsetEstimate": "meshreg.types",
-    "Registration": "meshreg.types",
+    "Survey": "meshreg.records",
+    "Mesh": "meshreg.records",
+    "PointCloud": "meshreg.records",
+    "Maps": "meshreg.records",
+    "Grid": "meshreg.records",
+    "SurveyRaster": "meshreg.records",
+    "Transform": "meshreg.records",
+    "Warp": "meshreg.records",
+    "OffsetEstimate": "meshreg.records",
+    "Registration": "meshreg.records",
     "MeshregError": "meshreg.errors",
 }
 __all__ = ["__version__", *_HOMES]  # noqa: PLE0604
@@ -49,19 +49,19 @@ if TYPE_CHECKING:
     from meshreg.offsets import estimate_offset as estimate_offset
     from meshreg.offsets import estimate_offsets as estimate_offsets
     from meshreg.pipeline import register_pair as register_pair
+    from meshreg.pipeline import self_test as self_test
     from meshreg.raster import rasterize as rasterize
-    from meshreg.selftest import self_test as self_test
+    from meshreg.records import Grid as Grid
+    from meshreg.records import Maps as Maps
+    from meshreg.records import Mesh as Mesh
+    from meshreg.records import OffsetEstimate as OffsetEstimate
+    from meshreg.records import PointCloud as PointCloud
+    from meshreg.records import Registration as Registration
+    from meshreg.records import Survey as Survey
+    from meshreg.records import SurveyRaster as SurveyRaster
+    from meshreg.records import Transform as Transform
+    from meshreg.records import Warp as Warp
     from meshreg.settings import Settings as Settings
-    from meshreg.types import Grid as Grid
-    from meshreg.types import Maps as Maps
-    from meshreg.types import Mesh as Mesh
-    from meshreg.types import OffsetEstimate as OffsetEstimate
-    from meshreg.types import PointCloud as PointCloud
-    from meshreg.types import Registration as Registration
-    from meshreg.types import Survey as Survey
-    from meshreg.types import SurveyRaster as SurveyRaster
-    from meshreg.types import Transform as Transform
-    from meshreg.types import Warp as Warp
 
 
 def __getattr__(name: str) -> Any:

@@ -1,5 +1,5 @@
 """`python -m meshreg`."""
 
-from meshreg.cli import main
+from meshreg.cli.app import main
 
 main()

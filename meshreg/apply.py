@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 
 from meshreg.errors import UsageError
-from meshreg.types import Maps, Mesh, PointCloud, Survey, Transform, Warp
+from meshreg.records import Maps, Mesh, PointCloud, Survey, Transform, Warp
 
 
 def apply_transform(

@@ -65,7 +65,7 @@ def shifted(survey: Any, shift: Any) -> Any:
     import numpy as np
 
     from meshreg.apply import apply_transform
-    from meshreg.types import Maps, Transform
+    from meshreg.records import Maps, Transform
 
     geometry = survey.geometry
     if not isinstance(geometry, Maps):

@@ -3,7 +3,7 @@
 
     scripts/corpus.py run OUT [--inputs DIR]   makes the inputs in DIR (default: OUT/inputs) if none
                                                are there, and registers every case into OUT
-    scripts/corpus.py compare BEFORE AFTER     names every file that differs; exit code 1 if one does
+    scripts/corpus.py compare BEFORE AFTER     names what differs; exit code 1 if any does
 
 Every format, both presets, every verdict. Seconds, the log and versions are left out of the
 comparison; all else is to be equal to the byte. `--tolerance 1e-6` compares transforms [m] and

@@ -11,8 +11,8 @@ ROOT = Path(__file__).parent.parent
 sys.path.insert(0, str(ROOT))
 
 from data_synth.recipe import LARGEST, RANGES, Recipe  # noqa: E402
-from meshreg.checked import Limits, wanted  # noqa: E402
 from meshreg.settings import Settings  # noqa: E402
+from meshreg.settings.checked import Limits, wanted  # noqa: E402
 
 PAGE = ROOT / "docs" / "settings.md"
 _HEAD = """# Settings

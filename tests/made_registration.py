@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from meshreg.records import Grid, OffsetEstimate, Registration, SurveyRaster, Transform
 from meshreg.settings import Settings
-from meshreg.types import Grid, OffsetEstimate, Registration, SurveyRaster, Transform
 
 EAST, NORTH = 731_500.0, 5_705_200.0  # UTM size on purpose
 OFFSET = np.array([1.3, -0.7, 0.25])

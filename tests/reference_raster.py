@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from meshreg.types import Grid, Mesh, PointCloud, Survey, Texture
+from meshreg.records import Grid, Mesh, PointCloud, Survey, Texture
 
 # -- scenes ---------------------------------------------------------------------------------------
 

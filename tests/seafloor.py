@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from meshreg.types import Grid, SurveyRaster
+from meshreg.records import Grid, SurveyRaster
 
 
 @dataclass(frozen=True)

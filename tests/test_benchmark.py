@@ -22,14 +22,14 @@ from data_synth.recipe import load
 from data_synth.scene import make_scene
 from data_synth.sfm import make_distortion
 from data_synth.truth import make_truth
-from meshreg import cli
 from meshreg.benchmark import Options, hand, maps, measure, page, plan, rasters, run, run_benchmark
 from meshreg.benchmark import jobs as running
 from meshreg.benchmark.summary import summarise
 from meshreg.benchmark.tables import COLUMNS, bounds, rate, write_csv
 from meshreg.benchmark.workers import run_all
+from meshreg.cli import app as cli
 from meshreg.errors import MeshregError, OutputError, UsageError
-from meshreg.types import Transform
+from meshreg.records import Transform
 
 NAMES = ("reef_12mo", "low_reef_24mo", "sand_12h", "elsewhere")
 SMALL = Options(scenarios=NAMES, repeats=2, elsewhere=4, size=8.0)

@@ -25,15 +25,15 @@ from rich.console import Console
 
 import meshreg
 import meshreg.pipeline
-from meshreg import cli
-from meshreg.cli_parts import common, console, info, machine
-from meshreg.cli_parts.arguments import Axes
-from meshreg.cli_parts.options import for_both, join_settings, read_options
+from meshreg.cli import app as cli
+from meshreg.cli import common, console, info, machine
+from meshreg.cli.arguments import Axes
+from meshreg.cli.options import for_both, join_settings, read_options
 from meshreg.doctor import Check, run_probe
 from meshreg.errors import InputError, UsageError
 from meshreg.io.document import read_registration
+from meshreg.records import Grid, Maps, Mesh, PointCloud, Survey, Transform
 from meshreg.settings import Settings
-from meshreg.types import Grid, Maps, Mesh, PointCloud, Survey, Transform
 
 ROOT = Path(__file__).parent.parent
 SCHEMA = json.loads((Path(meshreg.__file__).parent / "io/registration.schema.json").read_text())
@@ -305,7 +305,7 @@ def test_geometry_alone_where_the_texture_is_broken(
     """Every command that reads a survey takes the option that its error message names."""
     asked = verdict("accepted")
     monkeypatch.setattr(
-        "meshreg.selftest.self_test",
+        "meshreg.pipeline.self_test",
         lambda *surveys, **rest: SimpleNamespace(document=lambda: {"verdict": "accepted"}),
     )
     old, new = (write_obj(tmp_path / f"{name}.obj", k) for k, name in enumerate(("old", "new")))
@@ -934,7 +934,7 @@ def test_info_measures_the_tilt(angle: float) -> None:
 
 
 def test_info_measures_texels() -> None:
-    from meshreg.types import Texture
+    from meshreg.records import Texture
 
     corners = np.array([[0.0, 0, 0], [10, 0, 0], [0, 10, 0], [10, 10, 0]])
     faces = np.array([[0, 1, 2], [1, 3, 2]])

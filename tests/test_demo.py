@@ -17,7 +17,7 @@ from made_registration import OFFSET, YAW, made_registration
 from rich.console import Console
 
 import meshreg
-from meshreg.cli_parts import console, demonstrating
+from meshreg.cli import console, demonstrating
 
 ROOT = Path(__file__).parent.parent
 SCHEMA = json.loads((Path(meshreg.__file__).parent / "io/registration.schema.json").read_text())

@@ -18,7 +18,7 @@ import pytest
 import trimesh
 from test_pipeline import OFFSET, floors, survey
 
-from meshreg import cli
+from meshreg.cli import app as cli
 from meshreg.ties.table import COLUMNS
 
 HALF = 3.5

@@ -9,10 +9,10 @@ import re
 import pytest
 import seafloor
 
-from meshreg.far_pose import far_pose
-from meshreg.judge import Judgement
+from meshreg.judge.judging import Judgement
+from meshreg.judge.verdict import Found, findings, last_word
+from meshreg.pipeline.far_pose import far_pose
 from meshreg.settings import SearchSettings
-from meshreg.verdict import Found, findings, last_word
 
 HALF = 6.0
 

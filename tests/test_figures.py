@@ -14,9 +14,9 @@ import pytest
 from made_registration import EAST, NORTH, OFFSET, made_registration
 from PIL import Image
 
+from meshreg.records import Grid, OffsetEstimate, Registration, SurveyRaster
 from meshreg.report import draw_figures, evidence, overlays, residuals, scene, style
 from meshreg.report.figures import FIGURES, _picture, _save
-from meshreg.types import Grid, OffsetEstimate, Registration, SurveyRaster
 
 ALL = {*FIGURES, "scores_terrain", "scores_mutual_information"}
 

@@ -14,7 +14,7 @@ import pytest
 from made_registration import made_registration
 from PIL import Image
 
-from meshreg.cli_parts import drawing
+from meshreg.cli import drawing
 from meshreg.report import draw_figures
 
 SMALL = str(Path(__file__).parent.parent / "meshreg" / "demo_data" / "beach_2018.obj")

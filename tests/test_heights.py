@@ -15,8 +15,8 @@ from scipy.ndimage import gaussian_filter, map_coordinates, uniform_filter
 
 from meshreg import statistics
 from meshreg.errors import UsageError
-from meshreg.ground import SEEN, largest_sheet, neighbours
-from meshreg.heights import (
+from meshreg.height.ground import SEEN, largest_sheet, neighbours
+from meshreg.height.lifting import (
     CHANGED,
     MAX_TILT,
     SET_ASIDE,
@@ -26,7 +26,7 @@ from meshreg.heights import (
     rotation,
     stable_ground,
 )
-from meshreg.types import Transform
+from meshreg.records import Transform
 
 HERE = Transform()
 

@@ -10,11 +10,11 @@ import pytest
 import seafloor
 from scipy import ndimage
 
-from meshreg.judge import TURN_NAMES, agree_distance, channel_map, judge, relief_of
+from meshreg.judge.judging import TURN_NAMES, agree_distance, channel_map, judge, relief_of
 from meshreg.offsets import estimate_offsets
 from meshreg.offsets.neutral import fields
+from meshreg.records import Grid, OffsetEstimate, SurveyRaster
 from meshreg.settings import Settings
-from meshreg.types import Grid, OffsetEstimate, SurveyRaster
 
 OFFSET = (1.237, -2.412)
 SETTINGS = Settings().changed({"methods": "terrain,mutual_information", "search.radius": 5.0})

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import seafloor
 
-from meshreg import decision as deciding
-from meshreg.narrowing import cut, elsewhere, narrowing, places
 from meshreg.offsets.correlate import Window
+from meshreg.pipeline import decision as deciding
+from meshreg.pipeline.narrowing import cut, elsewhere, narrowing, places
 from meshreg.settings import SearchSettings, Settings
 
 OFFSET = np.array([13.4, -10.8])
@@ -132,7 +132,7 @@ def test_only_what_gains_by_it_is_narrowed():
 
 def test_chance_grows_with_what_was_looked_through():
     pairs = pair()
-    from meshreg.judge import channel_maps
+    from meshreg.judge.judging import channel_maps
 
     here = channel_maps(cut(pairs, tuple(OFFSET), 5.0), RADIUS, chance=False)
     there = channel_maps(cut(pairs, (-12.0, 12.0), 5.0), RADIUS, chance=False)

@@ -10,8 +10,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from meshreg import open3d_loading
-from meshreg.open3d_loading import LIBUSB, load_libusb
+from meshreg.refine import open3d_loading
+from meshreg.refine.open3d_loading import LIBUSB, load_libusb
 
 ROOT = Path(__file__).parent.parent
 LINUX = pytest.mark.skipif(sys.platform != "linux", reason="elsewhere Open3D brings its own libusb")

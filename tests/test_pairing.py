@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from made_registration import made_registration
 
-from meshreg.cli_parts import pairing
-from meshreg.cli_parts.common import SurveyRequest
+from meshreg.cli import pairing
+from meshreg.cli.common import SurveyRequest
 from meshreg.errors import ResourceLimitError, UsageError
 from meshreg.io.options import ReadOptions
+from meshreg.records import Frame, Grid, Maps, PointCloud, SourceFile, Survey
 from meshreg.settings import Settings
-from meshreg.types import Frame, Grid, Maps, PointCloud, SourceFile, Survey
 
 HOME = np.array([731_000.0, 5_705_000.0, 0.0])
 PLAIN = (SurveyRequest("old", ReadOptions()), SurveyRequest("new", ReadOptions()))

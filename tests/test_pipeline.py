@@ -12,12 +12,13 @@ import seafloor
 
 from meshreg import Mesh, PointCloud, Settings, Survey, apply_transform, register_pair
 from meshreg.errors import UsageError
-from meshreg.heights import STABLE, rotation
+from meshreg.height.lifting import STABLE, rotation
 from meshreg.io.evidence import read_evidence, write_evidence
+from meshreg.pipeline.compare import APART
+from meshreg.records import Transform
+from meshreg.refine.surfaces import Polished
 from meshreg.report import keep
-from meshreg.statistics import APART, registration_sigma
-from meshreg.surfaces import Polished
-from meshreg.types import Transform
+from meshreg.statistics import registration_sigma
 
 OFFSET = np.array([1.337, -2.412, 0.083])
 QUICK = Settings().changed({"search.radius": 5.0})
@@ -121,7 +122,7 @@ def test_the_tilt_that_counts_is_that_after_the_surfaces(monkeypatch, degrees, c
         turned = rotation([np.deg2rad(degrees), 0.0]) @ transform.rotation
         return Polished(dataclasses.replace(transform, rotation=turned), True, 0.0, 0.1, 0.1, "x")
 
-    monkeypatch.setattr("meshreg.pipeline.polish", tilted)
+    monkeypatch.setattr("meshreg.pipeline.register.polish", tilted)
     pair = survey(first, half=2.5, step=0.05, seed=1), displaced(survey(later, half=2.5, step=0.05))
     found = register_pair(pair[0], pair[1][0], QUICK.changed({"refine.surfaces": "gicp"}))
     assert [finding.code for finding in found.findings] == codes

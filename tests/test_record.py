@@ -21,8 +21,8 @@ import meshreg
 from meshreg.errors import InputError, UsageError
 from meshreg.io.document import SCHEMA, registration_document, to_json
 from meshreg.io.record import matrix_text, read_registration, write_registration
+from meshreg.records import Frame, Mesh, PointCloud, Registration, SourceFile, Survey
 from meshreg.settings import Settings, read_settings
-from meshreg.types import Frame, Mesh, PointCloud, Registration, SourceFile, Survey
 
 SCHEMA_FILE = Path(meshreg.__file__).parent / "io" / "registration.schema.json"
 VERDICTS = ("accepted", "review", "rejected")

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 import seafloor
 
-from meshreg.heading import as_delivered
-from meshreg.kriging import Ground
-from meshreg.refine import (
+from meshreg.heading.turning import as_delivered
+from meshreg.judge.verdict import MOST_UNDECIDED
+from meshreg.records import Grid, SurveyRaster, Transform
+from meshreg.refine.rigid import (
     Refined,
     blended,
     combined,
@@ -23,9 +24,8 @@ from meshreg.refine import (
     relief_height,
     with_scale,
 )
-from meshreg.tiles import TileOffsets
-from meshreg.types import Grid, SurveyRaster, Transform
-from meshreg.verdict import MOST_UNDECIDED
+from meshreg.refine.tiles import TileOffsets
+from meshreg.statistics.kriging import Ground
 
 OFFSET = (1.237, -2.412)
 REEF = Path(__file__).parent / "data" / "reef_dem" / "horseshoe_dem.tif"

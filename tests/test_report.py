@@ -23,11 +23,12 @@ from hypothesis import strategies as st
 from made_registration import EAST, NORTH, OFFSET, ground, made_registration, relief
 from PIL import Image
 
-from meshreg import cli
-from meshreg.cli_parts.reporting import add_report, keep_evidence, write_report
+from meshreg.cli import app as cli
+from meshreg.cli.reporting import add_report, keep_evidence, write_report
 from meshreg.errors import InputError, ResourceLimitError, UsageError
 from meshreg.io.evidence import NAME, read_evidence, write_evidence
 from meshreg.io.record import read_registration, write_registration
+from meshreg.records import Grid, Registration, SurveyRaster, Transform, Warp
 from meshreg.report import (
     Result,
     answer,
@@ -42,7 +43,6 @@ from meshreg.report import (
     words,
 )
 from meshreg.report.markup import json_block, number
-from meshreg.types import Grid, Registration, SurveyRaster, Transform, Warp
 
 VERDICTS = ("accepted", "review", "rejected")
 HOSTILE = "</script><img src=x onerror=alert(1)>\"'&[red]"
@@ -264,9 +264,9 @@ def test_advice_does_not_speak_of_a_distance_that_other_axes_explain() -> None:
 
 
 def test_every_reason_of_the_judge_has_advice_of_its_own() -> None:
-    import meshreg.judge
+    from meshreg.judge import judging
 
-    source = Path(meshreg.judge.__file__).read_text(encoding="utf-8")
+    source = Path(judging.__file__).read_text(encoding="utf-8")
     said = re.findall(r'say\(\s*"(?:review|rejected)",\s*f?"([^"]*)"', source)
     assert len(said) >= 7
     for reason in (text.replace("{how}", "when turned by 90°") for text in said):

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from meshreg.kriging import overlap_ground
-from meshreg.sandwich import block_sandwich
-from meshreg.types import Grid
+from meshreg.records import Grid
+from meshreg.statistics.kriging import overlap_ground
+from meshreg.statistics.sandwich import block_sandwich
 
 
 def by_loops(curvature, scores, block, lost):

@@ -9,9 +9,9 @@ import pytest
 
 from meshreg import PointCloud, Settings, Survey, register_pair
 from meshreg.errors import ResourceLimitError
-from meshreg.levels import pair_grids
-from meshreg.search_cost import require_search, search_cost
-from meshreg.types import Grid
+from meshreg.pipeline.levels import pair_grids
+from meshreg.pipeline.search_cost import require_search, search_cost
+from meshreg.records import Grid
 
 
 def grids(large, small, cell=0.1):

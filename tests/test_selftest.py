@@ -12,11 +12,12 @@ import seafloor
 from test_pipeline import OFFSET, displaced, floors, survey
 
 import meshreg
-from meshreg import Settings, cli
-from meshreg.cli_parts import selftesting
+from meshreg import Settings
+from meshreg.cli import app as cli
+from meshreg.cli import selftesting
 from meshreg.errors import UsageError
-from meshreg.selftest import SelfTest, Trial, motions, self_test
-from meshreg.types import Transform
+from meshreg.pipeline.selftest import SelfTest, Trial, motions, self_test
+from meshreg.records import Transform
 
 QUICK = Settings().changed({"search.radius": 5.0, "methods": "terrain,mutual_information"})
 
@@ -151,7 +152,7 @@ def test_command_refuses_another_place_with_exit_code_4(files, capsys):
 
 
 def test_table_names_what_can_be_resolved(capsys):
-    from meshreg.cli_parts.console import Voice
+    from meshreg.cli.console import Voice
 
     selftesting.show(good()[0].document(), Voice())
     said = capsys.readouterr().out

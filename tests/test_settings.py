@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from meshreg.checked import wanted
 from meshreg.errors import UsageError
 from meshreg.settings import Settings, TerrainSettings, read_settings, write_settings
+from meshreg.settings.checked import wanted
 
 ROOT = Path(__file__).parent.parent
 

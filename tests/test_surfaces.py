@@ -15,9 +15,9 @@ from seafloor import Seafloor
 
 from meshreg import Maps, Mesh, PointCloud, Survey, apply_transform
 from meshreg.errors import UsageError
-from meshreg.surfaces import check_surfaces, polish, sampled
-from meshreg.types import Grid, Transform
-from meshreg.verdict import Found, findings
+from meshreg.judge.verdict import Found, findings
+from meshreg.records import Grid, Transform
+from meshreg.refine.surfaces import check_surfaces, polish, sampled
 
 ROOT = Path(__file__).parent.parent
 SIGMA = {"x": 0.004, "y": 0.004, "z": 0.004}

@@ -9,9 +9,9 @@ import pytest
 import seafloor
 from scipy import ndimage
 
-from meshreg.tile_kernels import polish
-from meshreg.tiles import Overlap, Relief, correlated_tiles, polished_tiles
-from meshreg.types import Grid
+from meshreg.records import Grid
+from meshreg.refine.tile_kernels import polish
+from meshreg.refine.tiles import Overlap, Relief, correlated_tiles, polished_tiles
 
 CELL = 0.1
 

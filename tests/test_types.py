@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from meshreg.errors import UsageError
-from meshreg.types import Grid, Mesh, Registration, Transform
+from meshreg.records import Grid, Mesh, Registration, Transform
 
 number = st.floats(-1e3, 1e3)
 vector = st.tuples(number, number, number)

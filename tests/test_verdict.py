@@ -10,17 +10,17 @@ import seafloor
 from test_pipeline import QUICK, displaced, floors, survey
 
 from meshreg import Mesh, PointCloud, Survey, register_pair
-from meshreg.dem_pair import DemPair
 from meshreg.errors import InputError
-from meshreg.gain import Gain, relief_gain
-from meshreg.heights import fit_heights
-from meshreg.judge import Judgement
-from meshreg.layers import second_surface
+from meshreg.height.dem_pair import DemPair
+from meshreg.height.gain import Gain, relief_gain
+from meshreg.height.lifting import fit_heights
+from meshreg.judge.judging import Judgement
+from meshreg.judge.layers import second_surface
+from meshreg.judge.verdict import Found, Stretch, findings, last_word
 from meshreg.raster import rasterize
-from meshreg.tears import Tear, contradicts, find_tear
-from meshreg.tiles import TileOffsets
-from meshreg.types import SourceFile, Transform
-from meshreg.verdict import Found, Stretch, findings, last_word
+from meshreg.records import SourceFile, Transform
+from meshreg.refine.tears import Tear, contradicts, find_tear
+from meshreg.refine.tiles import TileOffsets
 
 
 def raised(one: Survey, times: float) -> Survey:

@@ -12,25 +12,19 @@ import seafloor
 
 from data_synth.rasters import make_rasters
 from data_synth.recipe import load
-from meshreg import (
-    Mesh,
-    Settings,
-    Survey,
-    apply_transform,
-    decision,
-    heading,
-    register_pair,
-    voting,
-)
+from meshreg import Mesh, Settings, Survey, apply_transform, register_pair
 from meshreg.benchmark.measure import register_rasters
-from meshreg.judge import judge
+from meshreg.heading import turning as heading
+from meshreg.heading import voting
+from meshreg.heading.tile_surfaces import channel_surfaces, surfaces_bytes
+from meshreg.heading.voting import STANDS_OUT, not_voted, similarity, vote
+from meshreg.heading.voting_kernels import BIAS, SCORED, strongest
+from meshreg.judge.judging import judge
+from meshreg.pipeline import decision
 from meshreg.raster.grid import coarsened
+from meshreg.records import Grid, SurveyRaster, Transform
 from meshreg.settings import SearchSettings
 from meshreg.statistics import registration_sigma
-from meshreg.tile_surfaces import channel_surfaces, surfaces_bytes
-from meshreg.types import Grid, SurveyRaster, Transform
-from meshreg.voting import STANDS_OUT, not_voted, similarity, vote
-from meshreg.voting_kernels import BIAS, SCORED, strongest
 
 OFFSET = np.array([1.337, -2.412, 0.083])
 SEARCH = SearchSettings()

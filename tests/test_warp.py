@@ -15,19 +15,28 @@ from made_registration import made_registration
 from scipy.interpolate import BSpline
 
 import meshreg
-from meshreg import cli
 from meshreg.apply import apply_transform
+from meshreg.cli import app as cli
+from meshreg.deformation.internal import Internal, check_model, measure
+from meshreg.deformation.ladder import FALL, Sample, choose, climb, intervals, steepest, strain
+from meshreg.deformation.warp_rasters import common_value, warped_raster
 from meshreg.errors import InputError, UsageError
 from meshreg.io import read_survey, require_warpable, rewrite_survey, write_survey
 from meshreg.io.document import read_registration, registration_document, to_json
-from meshreg.ladder import FALL, Sample, choose, climb, intervals, steepest, strain
 from meshreg.raster import rasterize
+from meshreg.records import (
+    Grid,
+    Maps,
+    Mesh,
+    PointCloud,
+    SourceFile,
+    Survey,
+    Transform,
+    Warp,
+)
+from meshreg.refine.tiles import TileOffsets
 from meshreg.report import residuals
 from meshreg.settings import RasterSettings, Settings, WarpSettings
-from meshreg.tiles import TileOffsets
-from meshreg.types import Grid, Maps, Mesh, PointCloud, SourceFile, Survey, Transform, Warp
-from meshreg.warp import Internal, check_model, measure
-from meshreg.warp_rasters import common_value, warped_raster
 
 SIDE = 3.6  # m, of a tile
 HALF = 12.6  # m, of the patch of 7 × 7 tiles
@@ -260,7 +269,8 @@ def test_held_out_is_what_a_fit_without_the_tile_says():
     places = lattice()[:25]
     values = np.random.default_rng(8).normal(0, NOISE, (25, 1))
     sample = sample_of(values, places)
-    from meshreg import held_out, ladder
+    from meshreg.deformation import ladder
+    from meshreg.statistics import held_out
 
     design = ladder._polynomials(places, sample, "rigid")
     weighted, groups = design, held_out.groups_of(sample.block)

@@ -16,7 +16,7 @@ from data_synth.recipe import Recipe
 from meshreg.benchmark import hand, maps, measure, rasters
 from meshreg.benchmark.plan import Job, key_of, recipe_of, settings_of, site_job
 from meshreg.io.atomic import atomic_file
-from meshreg.types import Registration, Survey
+from meshreg.records import Registration, Survey
 
 Record = dict[str, Any]
 WORK = ".work"  # in the folder of a run: what its processes are making

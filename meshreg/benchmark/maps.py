@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from meshreg.io.atomic import atomic_file
+from meshreg.records import OffsetEstimate, Registration, SurveyRaster
 from meshreg.report import evidence, overlays, style
-from meshreg.types import OffsetEstimate, Registration, SurveyRaster
 
 SECTION_EAST = 5.0  # m east of the map's south-west corner
 SURFACES = ("terrain", "mutual_information")

@@ -12,11 +12,9 @@ import numpy as np
 
 from meshreg.benchmark.hand import Hand
 from meshreg.benchmark.rasters import turned
-from meshreg.decision import Decision, decide
 from meshreg.offsets import search_radius
-from meshreg.refine import Refined
-from meshreg.settings import Settings
-from meshreg.types import (
+from meshreg.pipeline import Decision, decide
+from meshreg.records import (
     Float64,
     OffsetEstimate,
     Registration,
@@ -24,6 +22,8 @@ from meshreg.types import (
     Transform,
     Verdict,
 )
+from meshreg.refine import Refined
+from meshreg.settings import Settings
 
 SUCCESS = 0.25  # m: a larger error is a failure
 LEVEL_95 = -2.0 * math.log(0.05)  # chi-square, 2 degrees of freedom

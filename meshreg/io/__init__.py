@@ -18,7 +18,7 @@ from meshreg.io.options import ReadOptions
 if TYPE_CHECKING:
     from meshreg.io.record import read_registration as read_registration
     from meshreg.io.record import write_registration as write_registration
-    from meshreg.types import Survey, Transform, Warp
+    from meshreg.records import Survey, Transform, Warp
 
 READERS: dict[str, str] = {
     ".obj": "meshreg.io.obj:read",

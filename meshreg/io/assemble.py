@@ -18,7 +18,16 @@ from meshreg.io.options import ReadOptions
 from meshreg.io.polygons import usable_faces
 from meshreg.io.safe import FARTHEST, fingerprint, sha256
 from meshreg.io.sidecar import SidecarInfo
-from meshreg.types import Bool, Int32, Mesh, PointCloud, SourceFile, Survey, Texture, UInt8
+from meshreg.records import (
+    Bool,
+    Int32,
+    Mesh,
+    PointCloud,
+    SourceFile,
+    Survey,
+    Texture,
+    UInt8,
+)
 
 _LOG = logging.getLogger("meshreg")
 _MOST_LOST = 0.01  # share of points that may be NaN or infinite

@@ -18,7 +18,7 @@ from meshreg.io.naming import Planned, planned
 from meshreg.io.options import ReadOptions
 from meshreg.io.safe import data_errors, fingerprint, sha256
 from meshreg.io.sidecar import write_metadata, write_shift
-from meshreg.types import Float64, Frame, SourceFile, Survey, Transform, Warp
+from meshreg.records import Float64, Frame, SourceFile, Survey, Transform, Warp
 
 __all__ = ["Block", "find_blocks", "read_block", "require_warpable", "require_writable", "rewrite"]
 

@@ -23,7 +23,7 @@ from meshreg.io.crs import (
     unbound,
     vertical_datum,
 )
-from meshreg.types import Float64
+from meshreg.records import Float64
 
 _CHUNK = 1_000_000  # points passed to PROJ at once
 _WORST_ACCURACY = 10.0  # [m]; a change of datum that PROJ knows less well is refused

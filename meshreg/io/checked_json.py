@@ -8,8 +8,8 @@ import math
 from pathlib import Path
 from typing import Any
 
-from meshreg.checked import shown
 from meshreg.errors import InputError
+from meshreg.settings.checked import shown
 
 LARGEST = 1e15  # of any number; squares and products of such are still finite
 

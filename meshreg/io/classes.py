@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from meshreg.types import Bool
+from meshreg.records import Bool
 
 NOISE = (7, 18)
 WATER = (41, 42, 45)

@@ -24,7 +24,7 @@ from meshreg.io.laz_points import LazBackend
 from meshreg.io.options import ReadOptions
 from meshreg.io.safe import open_regular
 from meshreg.io.sidecar import find_sidecar
-from meshreg.types import Bool, Float64, PointCloud, Survey, UInt8
+from meshreg.records import Bool, Float64, PointCloud, Survey, UInt8
 
 __all__ = ["read", "rewrite", "write"]
 

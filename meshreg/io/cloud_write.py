@@ -20,7 +20,7 @@ from meshreg.io.mover import Mover, is_plain
 from meshreg.io.rewriting import require_unchanged, warn
 from meshreg.io.safe import atomic_file, open_regular
 from meshreg.io.second_reader import require_las
-from meshreg.types import Float64, PointCloud, SourceFile, Survey
+from meshreg.records import Float64, PointCloud, SourceFile, Survey
 
 _LOG = logging.getLogger("meshreg")
 _STEP = 1e-4  # [m or ft]; in degrees 1e-9, which is as much

@@ -34,7 +34,7 @@ from meshreg.io.similarity import (
     tilt_sigma,
     turn_up,
 )
-from meshreg.types import Float64, Frame, PointCloud, SourceFile, Survey
+from meshreg.records import Float64, Frame, PointCloud, SourceFile, Survey
 
 log = logging.getLogger("meshreg")
 

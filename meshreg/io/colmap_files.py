@@ -16,7 +16,7 @@ import numpy as np
 
 from meshreg.errors import InputError, UsageError
 from meshreg.io.safe import decode_name, file_bytes, open_regular, require_inside
-from meshreg.types import Float64, UInt8
+from meshreg.records import Float64, UInt8
 
 PARTS = ("cameras", "images", "points3D")
 _OPTIONAL = ("rigs", "frames")

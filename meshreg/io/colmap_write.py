@@ -18,7 +18,7 @@ import numpy as np
 from meshreg.errors import OutputError
 from meshreg.io.colmap_files import Model, ModelFiles, binary_places
 from meshreg.io.safe import copy_file, file_bytes, open_regular
-from meshreg.types import Float64
+from meshreg.records import Float64
 
 _POSE = re.compile(rb"(\s*\d+[ \t]+)((?:\S+[ \t]+){6}\S+)(.*)", re.DOTALL)  # of an image
 _FRAME = re.compile(rb"(\s*\d+[ \t]+\d+[ \t]+)((?:\S+[ \t]+){6}\S+)(.*)", re.DOTALL)

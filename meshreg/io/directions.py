@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from meshreg.io.mover import Mover
-from meshreg.types import Float64
+from meshreg.records import Float64
 
 _UNIT_VECTOR = re.compile(
     r"n|nr?m|nor|norm|.*normals?|.*(?:bi)?tangent|.*binormal|.*direction|dir|.*eigenvec(?:tor)?\d*|.*axis"

@@ -15,10 +15,10 @@ from typing import Any
 
 import numpy as np
 
-from meshreg.checked import shown
 from meshreg.errors import InputError, UsageError
 from meshreg.io.checked_json import parse_json, require_schema
-from meshreg.types import Finding, OffsetEstimate, Registration, Transform, Warp
+from meshreg.records import Finding, OffsetEstimate, Registration, Transform, Warp
+from meshreg.settings.checked import shown
 
 SCHEMA = "meshreg.registration/1"
 MAX_BYTES = 64_000_000  # a real record has some 20 kB

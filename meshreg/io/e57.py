@@ -40,7 +40,7 @@ from meshreg.io.frames import Mover, place
 from meshreg.io.options import ReadOptions
 from meshreg.io.rewriting import require_unchanged, warn
 from meshreg.io.safe import atomic_file, open_regular
-from meshreg.types import Float64, PointCloud, SourceFile, Survey, UInt8
+from meshreg.records import Float64, PointCloud, SourceFile, Survey, UInt8
 
 log = logging.getLogger("meshreg")
 

@@ -16,7 +16,7 @@ import numpy as np
 from meshreg.errors import InputError, MeshregError, OutputError
 from meshreg.io.decoding import Decoder
 from meshreg.io.e57_xml import Entry
-from meshreg.types import Bool, Float64, UInt8
+from meshreg.records import Bool, Float64, UInt8
 
 CHUNK = 1_000_000
 CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")

@@ -25,7 +25,7 @@ from meshreg.io.e57_pages import (
     to_logical,
 )
 from meshreg.io.safe import open_regular, require_proportion
-from meshreg.types import Float64
+from meshreg.records import Float64
 
 _PER_POINT = 100  # bytes of memory: coordinates, colours, and copies of them
 MAX_DEPTH = 64

@@ -34,7 +34,7 @@ from meshreg.io.precision import single_precision_note
 from meshreg.io.safe import FARTHEST
 from meshreg.io.sidecar import SidecarInfo, find_sidecar
 from meshreg.io.unapplied import unapplied_notes
-from meshreg.types import Float64, Frame, Maps, Mesh, PointCloud, SourceFile, Survey
+from meshreg.records import Float64, Frame, Maps, Mesh, PointCloud, SourceFile, Survey
 
 _LOG = logging.getLogger("meshreg")
 

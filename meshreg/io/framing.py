@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from meshreg.checked import shown
 from meshreg.errors import InputError, UsageError
 from meshreg.io.crs import (
     check_area,
@@ -18,7 +17,8 @@ from meshreg.io.crs import (
 )
 from meshreg.io.options import UNIT_RANGE, ReadOptions
 from meshreg.io.sidecar import SidecarInfo
-from meshreg.types import Float64, Frame
+from meshreg.records import Float64, Frame
+from meshreg.settings.checked import shown
 
 ENU = np.eye(3)
 NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])

@@ -18,7 +18,7 @@ from meshreg.errors import InputError, MeshregError, ResourceLimitError
 from meshreg.io.crs import crs_text, mend_proj_data
 from meshreg.io.geotiff_sides import MAGIC, Sides
 from meshreg.io.safe import FARTHEST, beside, open_regular, require_proportion
-from meshreg.types import Float64
+from meshreg.records import Float64
 
 _CACHE = 64  # MB; a twentieth of the memory else, filled by any large raster
 _WINDOW = 1 << 22  # pixels decoded at once

@@ -20,7 +20,7 @@ import numpy as np
 
 from meshreg.errors import InputError
 from meshreg.io.safe import beside, open_regular
-from meshreg.types import Bool, Float64
+from meshreg.records import Bool, Float64
 
 MAGIC = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 _MAX_BYTES = 1 << 24  # histograms and attribute tables are long

@@ -26,7 +26,7 @@ from meshreg.io.geotiff import (
     windows,
 )
 from meshreg.io.geotiff_sides import read_mask_file, read_sides
-from meshreg.types import Bool, Float32, Float64, UInt8
+from meshreg.records import Bool, Float32, Float64, UInt8
 
 # Written without being declared, by Metashape, PDAL, ODM, CODEM, ASP, and as others' defaults.
 # The large positive ones are those of ESRI, Surfer and netCDF.

@@ -14,7 +14,7 @@ from meshreg.errors import InputError, OutputError
 from meshreg.io.crs import parse_crs
 from meshreg.io.geotiff import environment, opened, windows
 from meshreg.io.safe import atomic_file, open_regular
-from meshreg.types import Bool, Float32, Grid, UInt8
+from meshreg.records import Bool, Float32, Grid, UInt8
 
 log = logging.getLogger("meshreg")
 

@@ -32,7 +32,7 @@ from meshreg.io.options import ReadOptions
 from meshreg.io.polygons import weld
 from meshreg.io.safe import MissingReferenceError
 from meshreg.io.sidecar import find_sidecar
-from meshreg.types import Survey
+from meshreg.records import Survey
 
 __all__ = ["read", "rewrite", "write"]
 

@@ -18,7 +18,7 @@ from meshreg.io.frames import Y_UP
 from meshreg.io.gltf_document import Document, extension
 from meshreg.io.options import FARTHEST, ReadOptions
 from meshreg.io.sidecar import SidecarInfo, find_sidecar
-from meshreg.types import Float64
+from meshreg.records import Float64
 
 NAME = "CESIUM_RTC"
 _GEOCENTRIC = "EPSG:4978"

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from meshreg.errors import InputError
 from meshreg.io.safe import file_bytes, resolve_reference
-from meshreg.types import Float64, UInt8
+from meshreg.records import Float64, UInt8
 
 _JSON, _BIN = 0x4E4F534A, 0x004E4942
 _DAMAGED = "The file is cut off or damaged; export or copy it again."

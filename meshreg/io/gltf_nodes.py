@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from meshreg.io.gltf_document import Document
-from meshreg.types import Float64
+from meshreg.records import Float64
 
 _DEPTH = 64
 _MAX_NODES = 1_000_000

@@ -15,7 +15,7 @@ from meshreg.io.gltf_nodes import mesh_instances
 from meshreg.io.gltf_texture import Pages
 from meshreg.io.options import ReadOptions
 from meshreg.io.safe import require_proportion
-from meshreg.types import Float64, Int32
+from meshreg.records import Float64, Int32
 
 _POINTS, _TRIANGLES, _STRIP, _FAN = 0, 4, 5, 6
 _PER_POINT = 100  # bytes of memory: coordinates, texture coordinates, and copies of them

@@ -27,7 +27,7 @@ from meshreg.io.rewriting import (
 )
 from meshreg.io.safe import atomic_file, file_bytes
 from meshreg.io.second_reader import require_glb
-from meshreg.types import Float64, SourceFile
+from meshreg.records import Float64, SourceFile
 
 _BENT = 1e-3  # most that a change of CRS may bend a survey moved by one matrix [m]
 _BLOCK = 1 << 24

@@ -15,7 +15,7 @@ from meshreg.io.gltf_document import Document, extension
 from meshreg.io.images import open_texture, open_texture_bytes
 from meshreg.io.options import ReadOptions
 from meshreg.io.safe import MissingReferenceError
-from meshreg.types import Texture
+from meshreg.records import Texture
 
 _CLAMP, _MIRROR = 33071, 33648
 _Change = Callable[[NDArray[np.float32]], NDArray[np.float32]]

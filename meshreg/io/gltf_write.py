@@ -19,7 +19,7 @@ from meshreg.io.images import EncodedImage
 from meshreg.io.rewriting import require_close
 from meshreg.io.safe import atomic_file, file_bytes
 from meshreg.io.sidecar import write_shift
-from meshreg.types import Frame, Mesh, PointCloud, Survey, Texture
+from meshreg.records import Frame, Mesh, PointCloud, Survey, Texture
 
 MOST_BYTES = 2**32 - 1  # of a GLB
 _MIME = {"JPEG": "image/jpeg", "PNG": "image/png"}

@@ -28,7 +28,7 @@ from meshreg.io.safe import (
     open_regular,
     require_proportion,
 )
-from meshreg.types import Texture, UInt8
+from meshreg.records import Texture, UInt8
 
 FORMATS = ("JPEG", "PNG", "TIFF", "WEBP")
 SUFFIXES = {"JPEG": ".jpg", "PNG": ".png", "TIFF": ".tif", "WEBP": ".webp"}

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from meshreg.io.directions import Directions, find_directions, stored, turn_columns
 from meshreg.io.mover import Mover
-from meshreg.types import Float64
+from meshreg.records import Float64
 
 
 def extra_directions(point_format: Any) -> Directions:

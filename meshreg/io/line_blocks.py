@@ -14,7 +14,7 @@ import numpy as np
 
 from meshreg.errors import InputError, ResourceLimitError
 from meshreg.io.safe import read_into
-from meshreg.types import UInt8
+from meshreg.records import UInt8
 
 BLOCK = 1 << 19  # bytes read at once
 LONGEST = 1 << 20  # bytes in a line, its continuation included

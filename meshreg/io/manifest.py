@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 from meshreg.errors import InputError, UsageError
 
 if TYPE_CHECKING:
-    from meshreg.types import Survey
+    from meshreg.records import Survey
 
 NAME = "manifest.json"
 SCHEMA = "meshreg.manifest/1"

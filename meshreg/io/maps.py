@@ -28,7 +28,15 @@ from meshreg.io.regrid import covering_grid, placed_grid, regrid
 from meshreg.io.rewriting import require_unchanged
 from meshreg.io.safe import fingerprint, sha256
 from meshreg.io.sidecar import SidecarInfo, find_sidecar
-from meshreg.types import Float64, Frame, Grid, Maps, SourceFile, Survey, SurveyRaster
+from meshreg.records import (
+    Float64,
+    Frame,
+    Grid,
+    Maps,
+    SourceFile,
+    Survey,
+    SurveyRaster,
+)
 
 log = logging.getLogger("meshreg")
 

@@ -14,7 +14,7 @@ from meshreg.io.mover import to_absolute
 from meshreg.io.options import ReadOptions
 from meshreg.io.regrid import Forward, Placed, covering_grid, regrid
 from meshreg.io.sidecar import SidecarInfo
-from meshreg.types import Bool, Float32, Frame, Grid, UInt8
+from meshreg.records import Bool, Float32, Frame, Grid, UInt8
 
 
 def map_frame(raw: RawMap, options: ReadOptions, sidecar: SidecarInfo | None) -> Frame:

@@ -21,7 +21,7 @@ from meshreg.errors import InputError
 from meshreg.io.bridge import bridge
 from meshreg.io.crs import crs_name, crs_text
 from meshreg.io.safe import FARTHEST, MissingReferenceError, open_regular, resolve_reference
-from meshreg.types import Bool, Float64, Grid
+from meshreg.records import Bool, Float64, Grid
 
 log = logging.getLogger("meshreg")
 

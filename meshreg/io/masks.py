@@ -28,7 +28,7 @@ from meshreg.io.mask_polygons import (
     read_shapefile,
 )
 from meshreg.io.safe import open_regular
-from meshreg.types import Bool, Float64, Frame, Grid, Survey
+from meshreg.records import Bool, Float64, Frame, Grid, Survey
 
 log = logging.getLogger("meshreg")
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from meshreg.errors import InputError
 from meshreg.io.frames import reframe
-from meshreg.types import Maps, Mesh, PointCloud, Survey
+from meshreg.records import Maps, Mesh, PointCloud, Survey
 
 
 def merge(surveys: Sequence[Survey], path: Any) -> Survey:

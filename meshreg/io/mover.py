@@ -9,7 +9,7 @@ import numpy as np
 
 from meshreg.errors import InputError, UsageError
 from meshreg.io.bridge import bridge
-from meshreg.types import Float64, Frame, SourceFile, Transform, Warp
+from meshreg.records import Float64, Frame, SourceFile, Transform, Warp
 
 
 def to_absolute(frame: Frame, xyz: Any) -> Float64:

@@ -20,7 +20,7 @@ from meshreg.io.safe import (
     resolve_reference,
 )
 from meshreg.io.udim import has_token, tile_pages
-from meshreg.types import SourceFile
+from meshreg.records import SourceFile
 
 _LIBRARY = re.compile(rb"(?m)^([ \t]*mtllib[ \t]+)([^\r\n]*?)([ \t]*\r?)$")
 _MAP = re.compile(

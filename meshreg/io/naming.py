@@ -10,7 +10,7 @@ from pathlib import Path, PurePosixPath
 
 from meshreg.io.atomic import short_name
 from meshreg.io.safe import sha256
-from meshreg.types import SourceFile, Survey
+from meshreg.records import SourceFile, Survey
 
 _LONGEST = 255  # bytes of a name, in every usual file system
 _ROOM = 40  # of them kept for "_registered", a number, a side file's suffix

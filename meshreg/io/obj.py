@@ -30,7 +30,7 @@ from meshreg.io.obj_write import rewrite, write
 from meshreg.io.options import ReadOptions
 from meshreg.io.polygons import Triangles, triangulate, usable_faces
 from meshreg.io.safe import MissingReferenceError, resolve_reference
-from meshreg.types import Float32, Int32, Survey, Texture, UInt8
+from meshreg.records import Float32, Int32, Survey, Texture, UInt8
 
 __all__ = ["read", "rewrite", "write"]
 _MOST_NOTES = 20  # on materials and pages, of which there may be thousands

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from meshreg.io.line_blocks import BLOCK, LONGEST, Block
 from meshreg.io.safe import decode_name
-from meshreg.types import Float32, Float64, Int32
+from meshreg.records import Float32, Float64, Int32
 
 _NUMBER = re.compile(rb"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 _NONFINITE = re.compile(rb"[+-]?(nan|inf|1\.#)", re.IGNORECASE)  # as C libraries print them

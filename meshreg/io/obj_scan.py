@@ -18,7 +18,7 @@ from meshreg.errors import InputError, ResourceLimitError
 from meshreg.io.line_blocks import LONGEST, Block, in_order, line_blocks
 from meshreg.io.obj_lines import Lines, Worker, word_at
 from meshreg.io.safe import open_regular
-from meshreg.types import Float32, Float64, Int32
+from meshreg.records import Float32, Float64, Int32
 
 _COUNTED = (
     *("VERTICES", "UVS", "NORMALS", "FACES", "OBJECTS", "GROUPS"),

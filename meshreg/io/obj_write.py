@@ -30,7 +30,7 @@ from meshreg.io.rewriting import (
 from meshreg.io.safe import atomic_file, open_regular
 from meshreg.io.second_reader import ANYTHING, Expected, LineRule, require_lines
 from meshreg.io.sidecar import write_shift
-from meshreg.types import Float64, Frame, Mesh, PointCloud, SourceFile, Survey, UInt8
+from meshreg.records import Float64, Frame, Mesh, PointCloud, SourceFile, Survey, UInt8
 
 _ROWS = 1 << 16  # rows turned into text at once
 _FEWEST_DECIMALS = 6

@@ -25,7 +25,7 @@ from meshreg.io.rewriting import (
 from meshreg.io.safe import atomic_file, file_bytes, open_regular, require
 from meshreg.io.second_reader import SLACK
 from meshreg.io.sidecar import write_shift
-from meshreg.types import Float64, Frame, Mesh, SourceFile, Survey
+from meshreg.records import Float64, Frame, Mesh, SourceFile, Survey
 
 _MOST_READ_TWICE = 50_000_000  # bytes
 _COMMENT = re.compile(rb"#[^\r\n]*")

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
-from meshreg.checked import checked_values, choice, flag, listed, number
+from meshreg.settings.checked import checked_values, choice, flag, listed, number
 
 FARTHEST = 1e9  # m; the Earth's own coordinates stay under 1e8 in feet
 UNIT_RANGE = (1e-9, 1e9)  # metres per unit

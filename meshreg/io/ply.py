@@ -28,7 +28,7 @@ from meshreg.io.ply_header import Header, read_header
 from meshreg.io.ply_write import direction_notes, rewrite, write
 from meshreg.io.polygons import Triangles, triangulate
 from meshreg.io.safe import MissingReferenceError, decode_name, file_bytes, resolve_reference
-from meshreg.types import Float32, Int32, Survey, Texture
+from meshreg.records import Float32, Int32, Survey, Texture
 
 __all__ = ["read", "rewrite", "write"]
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from meshreg.errors import InputError
 from meshreg.io.ply_header import Element, Header
 from meshreg.io.ply_text import CUT, fitting, line_of, read_numbers, start_of_row
-from meshreg.types import Float64, UInt8
+from meshreg.records import Float64, UInt8
 
 _NO_FLOATS = np.empty(0, np.float64)
 _NO_INTS = np.empty(0, np.int64)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from meshreg.errors import InputError
 from meshreg.io.ply_header import Property
-from meshreg.types import Float64, UInt8
+from meshreg.records import Float64, UInt8
 
 CUT = "The file is cut off or damaged; export or copy it again."
 _NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")

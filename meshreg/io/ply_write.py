@@ -32,7 +32,7 @@ from meshreg.io.rewriting import (
 from meshreg.io.safe import atomic_file, file_bytes, resolve_reference
 from meshreg.io.second_reader import SLACK, require_ply
 from meshreg.io.sidecar import write_shift
-from meshreg.types import Frame, Mesh, PointCloud, SourceFile, Survey
+from meshreg.records import Frame, Mesh, PointCloud, SourceFile, Survey
 
 _CHUNK = 1 << 18  # rows
 _BLOCK = 1 << 24  # bytes

@@ -14,7 +14,7 @@ import numpy as np
 
 from meshreg.errors import InputError
 from meshreg.io.safe import MissingReferenceError, open_regular, resolve_reference
-from meshreg.types import Float64
+from meshreg.records import Float64
 
 _MAX_BYTES = 100_000_000
 _BROKEN = (OSError, ValueError, KeyError, TypeError, ZeroDivisionError, SyntaxError)

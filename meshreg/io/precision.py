@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from meshreg.errors import InputError
-from meshreg.types import Float64
+from meshreg.records import Float64
 
 _EXPORT = "Export it in local coordinates with a shift, or with 64-bit numbers."
 _COLLAPSED = 0.02  # share of points fallen together from which 32-bit steps have spoilt a survey

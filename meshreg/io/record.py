@@ -11,7 +11,14 @@ from typing import Any
 import numpy as np
 
 from meshreg.io.document import read_registration, registration_document, to_json
-from meshreg.types import Frame, PointCloud, Registration, SourceFile, Survey, Transform
+from meshreg.records import (
+    Frame,
+    PointCloud,
+    Registration,
+    SourceFile,
+    Survey,
+    Transform,
+)
 
 __all__ = [
     "matrix_text",

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from meshreg.errors import InputError, ResourceLimitError
-from meshreg.types import Bool, Float32, Float64, Grid, UInt8
+from meshreg.records import Bool, Float32, Float64, Grid, UInt8
 
 Forward = Callable[[Float64], Float64]
 _STEP = 32  # cells between nodes at which the map is solved exactly

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from meshreg.errors import InputError, OutputError, UsageError
 from meshreg.io.mover import Mover
 from meshreg.io.safe import copy_file, fingerprint
-from meshreg.types import Float64, SourceFile, ends
+from meshreg.records import Float64, SourceFile, ends
 
 _LOG = logging.getLogger("meshreg")
 FINEST = 1e-4  # coarsest step of stored coordinates [m] that counts as lossless

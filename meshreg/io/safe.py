@@ -30,7 +30,7 @@ from meshreg.errors import (
     UnsafeReferenceError,
 )
 from meshreg.io.atomic import as_output_error, atomic_file, atomic_folder
-from meshreg.types import UInt8
+from meshreg.records import UInt8
 
 _SCHEME_OR_DRIVE = re.compile(r"[A-Za-z][A-Za-z0-9+.\-]*:")
 FARTHEST = 1e12  # coordinates from here on are damage: no unit makes the Earth that large

@@ -18,7 +18,7 @@ import numpy as np
 
 from meshreg.errors import OutputError
 from meshreg.io.safe import open_regular
-from meshreg.types import Float64
+from meshreg.records import Float64
 
 _BLOCK = 1 << 24
 SLACK = 1e-7  # [m]; coordinates of 1e7 m are rounded by 2e-9 at each step

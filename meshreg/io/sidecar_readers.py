@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from meshreg.checked import parse_toml, shown
 from meshreg.errors import InputError
 from meshreg.io.options import FARTHEST, UNIT_RANGE
 from meshreg.io.safe import beside, decode_name, open_regular
+from meshreg.settings.checked import parse_toml, shown
 
 _MAX_BYTES = 1 << 20  # coords.txt lists every photograph; the rest are a few lines
 KEYS = frozenset(("name", "date", "crs", "shift", "axes", "up", "unit", "columns"))

@@ -9,7 +9,7 @@ import numpy as np
 
 from meshreg.errors import OutputError
 from meshreg.io.safe import atomic_file
-from meshreg.types import Frame
+from meshreg.records import Frame
 
 
 def write_shift(path: Path, frame: Frame, *, carries_crs: bool = False) -> tuple[Path, ...]:

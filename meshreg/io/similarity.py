@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from meshreg.types import Bool, Float64
+from meshreg.records import Bool, Float64
 
 _DRAWS = 500
 _ROUNDS = 50

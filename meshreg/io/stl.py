@@ -32,7 +32,7 @@ from meshreg.io.rewriting import (
 from meshreg.io.safe import atomic_file, file_bytes, open_regular
 from meshreg.io.second_reader import ANYTHING, SLACK, Expected, require_lines, require_rows
 from meshreg.io.sidecar import write_shift
-from meshreg.types import Float64, Frame, Mesh, SourceFile, Survey, UInt8
+from meshreg.records import Float64, Frame, Mesh, SourceFile, Survey, UInt8
 
 _FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 _CORNER = (b"vertex", None, None, None)  # None: a number

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from meshreg.io.safe import decode_name, open_regular
-from meshreg.types import Float64, Frame
+from meshreg.records import Float64, Frame
 
 _HEAD = 1 << 13  # bytes looked at
 _FEW = 3  # notes on one file

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from meshreg.types import Bool, Float64, PointCloud, Survey
+from meshreg.records import Bool, Float64, PointCloud, Survey
 
 _BITS = (22, 22, 20)  # of east, north, up in a voxel's 64-bit number
 _FEW = 1_000_000  # points; of more, a sixteenth of the voxels is looked at first

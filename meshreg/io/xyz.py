@@ -19,7 +19,7 @@ from meshreg.io.sidecar import SidecarInfo, find_sidecar
 from meshreg.io.xyz_layout import read_layout
 from meshreg.io.xyz_values import columns_of
 from meshreg.io.xyz_write import rewrite, write
-from meshreg.types import Float64, PointCloud, Survey, UInt8
+from meshreg.records import Float64, PointCloud, Survey, UInt8
 
 __all__ = ["read", "rewrite", "write"]
 

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from meshreg.types import Bool, Float64
+from meshreg.records import Bool, Float64
 
 _NAMES = {
     "x": ("x", "east", "easting", "e", "xcoord", "coordx", "coordinatex", "utmx", "utme"),

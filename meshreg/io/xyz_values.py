@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from meshreg.errors import InputError
 from meshreg.io.xyz_layout import Layout
-from meshreg.types import Float64
+from meshreg.records import Float64
 
 _UNSETTLED = 65_536
 

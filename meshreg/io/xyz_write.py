@@ -20,7 +20,7 @@ from meshreg.io.second_reader import ANYTHING, Expected, LineRule, require_lines
 from meshreg.io.sidecar import find_sidecar, write_shift
 from meshreg.io.xyz_layout import Layout, read_layout
 from meshreg.io.xyz_values import columns_of
-from meshreg.types import Float64, Frame, PointCloud, SourceFile, Survey
+from meshreg.records import Float64, Frame, PointCloud, SourceFile, Survey
 
 _XYZ = ("x", "y", "z")
 _BLOCK = 1 << 22

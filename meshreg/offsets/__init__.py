@@ -25,8 +25,8 @@ from meshreg.offsets.error_bars import (
     whole_shift,
 )
 from meshreg.offsets.surface import Peak
+from meshreg.records import Bool, Float64, OffsetEstimate, SurveyRaster
 from meshreg.settings import Settings
-from meshreg.types import Bool, Float64, OffsetEstimate, SurveyRaster
 
 log = logging.getLogger(__name__)
 Estimate = Callable[[SurveyRaster, SurveyRaster, Settings], OffsetEstimate]

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from meshreg.types import Bool, Float64, SurveyRaster
+from meshreg.records import Bool, Float64, SurveyRaster
 
 
 def grey(raster: SurveyRaster) -> Float64:

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from meshreg.errors import UsageError
-from meshreg.types import Bool, Float64, Grid
+from meshreg.records import Bool, Float64, Grid
 
 Complex = NDArray[np.complexfloating[Any, Any]]
 _SMALL = 1 << 16  # cells of a transform; more of them at once would leave the cache

@@ -22,10 +22,9 @@ from typing import Any
 
 import numpy as np
 
-from meshreg.kriging import Ground, best_motion, overlap_ground
 from meshreg.offsets.surface import MAD_TO_SIGMA
-from meshreg.sandwich import block_sandwich
-from meshreg.types import Bool, Float64, Grid
+from meshreg.records import Bool, Float64, Grid
+from meshreg.statistics import Ground, best_motion, block_sandwich, overlap_ground
 
 BLOCK = 2.0  # m: several times the length over which high-passed heights or grey are alike
 BLOCK_CELLS = (16, 40)  # but at least and at most so many cells wide

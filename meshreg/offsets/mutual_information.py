@@ -21,8 +21,8 @@ from meshreg.offsets.channels import grey, local_normalised
 from meshreg.offsets.correlate import Correlator, Window, overlap_floor
 from meshreg.offsets.error_bars import laid
 from meshreg.offsets.surface import Peak, find_peak
+from meshreg.records import Bool, Float64, SurveyRaster
 from meshreg.settings import MutualInformationSettings, Settings
-from meshreg.types import Bool, Float64, SurveyRaster
 
 SINGLE_CELLS = 200_000
 

@@ -20,8 +20,8 @@ import numpy as np
 from meshreg.offsets import correlate
 from meshreg.offsets.channels import grey, local_normalised
 from meshreg.offsets.error_bars import BLOCK, FLOOR, MOST, Blocks, error_bar, ground_of
+from meshreg.records import Bool, Float64, SurveyRaster, UInt8
 from meshreg.settings import Settings, SiftSettings
-from meshreg.types import Bool, Float64, SurveyRaster, UInt8
 
 MARGIN = 96  # px: how far outside a tile's core features may still look
 

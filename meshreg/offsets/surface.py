@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from meshreg.types import Float64
+from meshreg.records import Float64
 
 MAD_TO_SIGMA = 1.4826
 

@@ -20,8 +20,8 @@ import numpy as np
 from meshreg.offsets.channels import high_pass
 from meshreg.offsets.correlate import Correlator, Window, overlap_floor
 from meshreg.offsets.surface import Peak, find_peak
+from meshreg.records import Float64, SurveyRaster
 from meshreg.settings import Settings, TerrainSettings
-from meshreg.types import Float64, SurveyRaster
 
 FLAT = 1e-6  # smallest s1 * s2 that is divided by [m²]
 

@@ -20,8 +20,8 @@ from meshreg.raster.maps import draw_maps
 from meshreg.raster.mesh import draw_mesh
 from meshreg.raster.placing import place
 from meshreg.raster.spacing import Spacing, measure_spacing
+from meshreg.records import Grid, Maps, Mesh, Survey, SurveyRaster, Transform
 from meshreg.settings import RasterSettings
-from meshreg.types import Grid, Maps, Mesh, Survey, SurveyRaster, Transform
 
 log = logging.getLogger("meshreg")
 

@@ -9,8 +9,8 @@ import numpy as np
 
 from meshreg.errors import UsageError
 from meshreg.raster.spacing import Spacing, measure_spacing, rounded, survey_bounds
+from meshreg.records import PointCloud, Survey
 from meshreg.settings import RasterSettings
-from meshreg.types import PointCloud, Survey
 
 PAPER_DEM_CELL = 0.10  # Bryson et al. 2013, III-C
 PAPER_ORTHO_CELL = 0.05  # III-D

@@ -8,8 +8,8 @@ from meshreg.raster.finish import Layers, empty_layers
 from meshreg.raster.floaters import floating_points
 from meshreg.raster.placing import Placing
 from meshreg.raster.spacing import Spacing
+from meshreg.records import Grid, PointCloud
 from meshreg.settings import RasterSettings
-from meshreg.types import Grid, PointCloud
 
 _LAYER_CELLS = 2.0  # thickness of the top layer: what a cell on a slope of 60 degrees spans
 _PASSES = 4  # each takes at least half of what is left

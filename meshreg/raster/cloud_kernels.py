@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from meshreg.jit import jit, prange
-from meshreg.types import Bool, Float32, Float64, Int32, UInt8
+from meshreg.records import Bool, Float32, Float64, Int32, UInt8
 
 Int64 = NDArray[np.int64]
 _CHUNK = 65536

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from meshreg.errors import UsageError
+from meshreg.records import Bool, Float32, Grid, SurveyRaster, Transform, UInt8
 from meshreg.settings import RasterSettings
-from meshreg.types import Bool, Float32, Grid, SurveyRaster, Transform, UInt8
 
 _FLAT_SHARE = 0.005  # of the colored cells: less is not worth a mask
 _FLAT_TEXELS = 12  # width of a flat piece: over one 8 × 8 block of JPEG, which may well be flat

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from meshreg.jit import jit, prange
-from meshreg.types import Bool, Float32, Int32, UInt8
+from meshreg.records import Bool, Float32, Int32, UInt8
 
 UInt16 = NDArray[np.uint16]
 Int64 = NDArray[np.int64]

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from meshreg.jit import jit, prange
-from meshreg.types import Bool, Float64, Int32
+from meshreg.records import Bool, Float64, Int32
 
 _CHUNK = 65536
 

@@ -12,7 +12,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from meshreg.types import Bool, Float64, Int32, Mesh
+from meshreg.records import Bool, Float64, Int32, Mesh
 
 _SMALL = 0.05  # share of the ground (mesh) that a floater may cover, and that all together may
 _FEW = 0.01  # share of the points (cloud) that all floaters together may be

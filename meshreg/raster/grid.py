@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from meshreg.errors import InputError, ResourceLimitError, UsageError
 from meshreg.raster.cells import Cells, choose_cells
 from meshreg.raster.spacing import Spacing, measure_spacing, rounded, survey_bounds
-from meshreg.types import Float64, Grid, Maps, Survey, SurveyRaster, Transform
+from meshreg.records import Float64, Grid, Maps, Survey, SurveyRaster, Transform
 
 __all__ = [
     "Cells",
@@ -22,6 +23,7 @@ __all__ = [
     "coarsened",
     "common_grid",
     "measure_spacing",
+    "on_grid",
     "require_together",
     "survey_bounds",
     "survey_grid",
@@ -190,6 +192,38 @@ def common_grid(a: Grid, b: Grid) -> Grid:
     right = max(a.shape[1], col + b.shape[1])
     west, north = rounded(a.west + left * a.cell), rounded(a.north - top * a.cell)
     return Grid(west, north, a.cell, (bottom - top, right - left), a.crs)
+
+
+def on_grid(raster: SurveyRaster, grid: Grid) -> SurveyRaster:
+    """Copy a raster into a larger grid of the same lattice; nothing is resampled.
+
+    Raises
+    ------
+    UsageError
+        If the grid does not hold the raster, or is shifted by a part of a cell.
+    """
+    row, col = grid.row_col(*raster.grid.east_north(0, 0))
+    top, left = round(float(row)), round(float(col))
+    rows, cols = raster.grid.shape
+    fits = 0 <= top <= grid.shape[0] - rows and 0 <= left <= grid.shape[1] - cols
+    if not fits or max(abs(row - top), abs(col - left)) > 1e-3:
+        raise UsageError(f"Grid {grid} does not hold {raster.grid} on one lattice.")
+    part = (slice(top, top + rows), slice(left, left + cols))
+
+    def placed(array: Any, empty: Any) -> Any:
+        whole = np.full((*grid.shape, *array.shape[2:]), empty, array.dtype)
+        whole[part] = array
+        return whole
+
+    return replace(
+        raster,
+        grid=grid,
+        height=placed(raster.height, np.nan),
+        color=placed(raster.color, 0),
+        valid=placed(raster.valid, False),
+        color_valid=placed(raster.color_valid, False),
+        samples=placed(raster.samples, 0),
+    )
 
 
 def coarsened(raster: SurveyRaster, times: int, share: float = LEAST_SHARE) -> SurveyRaster:

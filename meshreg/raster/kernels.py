@@ -26,7 +26,7 @@ from meshreg.raster.shade_kernels import (
     shade_textures,
     shade_vertices,
 )
-from meshreg.types import Bool, Float32, Float64, Int32
+from meshreg.records import Bool, Float32, Float64, Int32
 
 UInt16 = NDArray[np.uint16]
 Int64 = NDArray[np.int64]

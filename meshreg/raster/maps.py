@@ -9,7 +9,7 @@ import numpy as np
 from meshreg.errors import UsageError
 from meshreg.raster.finish import Layers, empty_layers
 from meshreg.raster.placing import Placing
-from meshreg.types import Float64, Grid, Maps
+from meshreg.records import Float64, Grid, Maps
 
 
 def draw_maps(maps: Maps, placing: Placing, grid: Grid) -> Layers:

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from meshreg.jit import jit, prange
-from meshreg.types import Bool, Float32, Float64, UInt8
+from meshreg.records import Bool, Float32, Float64, UInt8
 
 
 @jit(nogil=True, inline="always")

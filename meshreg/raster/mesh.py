@@ -13,8 +13,8 @@ from meshreg.raster.floaters import faces_to_keep
 from meshreg.raster.grid import LEAST_SHARE
 from meshreg.raster.placing import Placing
 from meshreg.raster.spacing import Spacing
+from meshreg.records import Bool, Float64, Grid, Int32, Mesh
 from meshreg.settings import RasterSettings
-from meshreg.types import Bool, Float64, Grid, Int32, Mesh
 
 if TYPE_CHECKING:
     from meshreg.raster.kernels import BandFaces

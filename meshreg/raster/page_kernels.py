@@ -8,7 +8,7 @@ import numpy as np
 
 from meshreg.jit import jit, prange
 from meshreg.raster.shade_kernels import SEEN, UInt32
-from meshreg.types import Float32, Float64, Int32, UInt8
+from meshreg.records import Float32, Float64, Int32, UInt8
 
 
 @jit(parallel=True, nogil=True)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from meshreg.types import Float64, Grid, Survey, Transform
+from meshreg.records import Float64, Grid, Survey, Transform
 
 
 @dataclass(frozen=True)

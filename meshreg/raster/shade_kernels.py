@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from meshreg.jit import jit, prange
-from meshreg.types import Bool, Float32, Float64, Int32, UInt8
+from meshreg.records import Bool, Float32, Float64, Int32, UInt8
 
 UInt32 = NDArray[np.uint32]
 SEEN = 0xFF000000

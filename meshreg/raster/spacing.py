@@ -8,7 +8,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from meshreg.errors import InputError
-from meshreg.types import Float64, Maps, Mesh, PointCloud, Survey, Transform, ends
+from meshreg.records import Float64, Maps, Mesh, PointCloud, Survey, Transform, ends
 
 CLOSEST = 1e-9  # m; nearer points are one place in numbers that hold a survey's
 _SAMPLE = 50_000  # faces or points looked at; every n-th, so that the answer is repeatable

@@ -15,7 +15,7 @@ import numpy as np
 
 from meshreg.errors import InputError
 from meshreg.raster.spacing import median_texel, texel_sizes
-from meshreg.types import Int32, Mesh, Texture, UInt8
+from meshreg.records import Int32, Mesh, Texture, UInt8
 
 if TYPE_CHECKING:
     from meshreg.raster.shade_kernels import Pages

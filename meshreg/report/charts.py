@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from meshreg.records import Grid, Registration
 from meshreg.report import style
 from meshreg.report.frame import SHAPES, Frame, key, line, mark
 from meshreg.report.markup import data_uri, number, say
-from meshreg.types import Grid, Registration
 
 FAINT = 0.02  # share of the largest weight under which a tile counts for nothing
 ELLIPSE_95 = math.sqrt(5.991)  # chi-square with 2 degrees of freedom

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from meshreg.records import OffsetEstimate, Registration
 from meshreg.report import stated, style
-from meshreg.types import OffsetEstimate, Registration
 
 MAX_MATCHES = 400  # lines drawn; more would only be a smear
 

@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
+from meshreg.records import Registration
 from meshreg.report import evidence, overlays, residuals, scene, style
-from meshreg.types import Registration
 
 _LOG = logging.getLogger("meshreg")
 

@@ -13,8 +13,15 @@ from typing import Any
 
 import numpy as np
 
+from meshreg.records import (
+    Float64,
+    Grid,
+    OffsetEstimate,
+    Registration,
+    SurveyRaster,
+    Transform,
+)
 from meshreg.report import pictures, stated, style
-from meshreg.types import Float64, Grid, OffsetEstimate, Registration, SurveyRaster, Transform
 
 SCHEMA = "meshreg.evidence/1"
 STAGES = ("reference", "before", "after")

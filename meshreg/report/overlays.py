@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from meshreg.records import Grid, Registration, SurveyRaster
 from meshreg.report import style
-from meshreg.types import Grid, Registration, SurveyRaster
 
 
 def draw_relief(registration: Registration) -> Any:

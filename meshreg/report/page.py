@@ -11,10 +11,10 @@ import hashlib
 from collections.abc import Callable
 from importlib import resources
 
+from meshreg.records import Registration
 from meshreg.report import answer, comparing, findings, provenance
 from meshreg.report.markup import say
 from meshreg.report.result import Result, name_of
-from meshreg.types import Registration
 
 _SCRIPTS = ("viewer.js", "section.js", "scene.js")
 # Name, title in the list of contents, and the function that writes it, or nothing.

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from meshreg.types import Float64, SurveyRaster, UInt8
+from meshreg.records import Float64, SurveyRaster, UInt8
 
 SIDE = 2048  # longest side of a picture in the page
 # What is tried until a picture fits: its share of the longest side, and the encoder's quality.

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from meshreg.records import Registration
 from meshreg.report import style
-from meshreg.types import Registration
 
 FAINT = 0.02  # share of the largest weight under which a tile counts for nothing
 

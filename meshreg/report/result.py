@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from meshreg.types import Registration
+from meshreg.records import Registration
 
 PAGE = "report.html"
 MANIFEST = "manifest.json"  # keeps the sums of the page too, so that it is no part of it

@@ -18,8 +18,8 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
+from meshreg.records import Registration
 from meshreg.report import style
-from meshreg.types import Registration
 
 Renderer: TypeAlias = "subprocess.Popen[str]"
 _LOG = logging.getLogger("meshreg")

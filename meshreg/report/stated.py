@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from meshreg.types import Float64, Registration, Transform
+from meshreg.records import Float64, Registration, Transform
 
 Answer = tuple[tuple[float, float], Float64 | None]
 

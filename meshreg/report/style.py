@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from meshreg.types import Float64, Grid, SurveyRaster, UInt8
+from meshreg.records import Float64, Grid, SurveyRaster, UInt8
 
 # Okabe and Ito's palette: told apart with every common colour vision, and in grey.
 REFERENCE = "#0072B2"  # blue

@@ -6,9 +6,9 @@ import math
 import re
 from typing import Any
 
+from meshreg.records import Registration
 from meshreg.report import style
 from meshreg.report.markup import number
-from meshreg.types import Registration
 
 PAPER = (
     "M. Bryson, M. Johnson-Roberson, O. Pizarro and S. B. Williams, Automated registration for "

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from meshreg.types import Float64
+from meshreg.records import Float64
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from meshreg.records import Float64, Transform
 from meshreg.settings import SiftSettings
 from meshreg.ties.cover import sectors, weak_spots
 from meshreg.ties.hand import (
@@ -25,7 +26,6 @@ from meshreg.ties.placing import Placing
 from meshreg.ties.records import TiePoints
 from meshreg.ties.session import Session, as_place
 from meshreg.ties.tiles import TileSource, overlap_points
-from meshreg.types import Float64, Transform
 
 SCHEMA = "meshreg.pick/1"
 Move = Callable[[Any], Float64]

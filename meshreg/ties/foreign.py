@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from meshreg.errors import UsageError
+from meshreg.records import Float64
 from meshreg.ties.records import Point
 from meshreg.ties.table import number
-from meshreg.types import Float64
 
 KNOWN = (
     "Give the ties.csv of `meshreg pick`, markers exported from Metashape, or TagLab's annotation "

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 
 from meshreg.offsets import sift
+from meshreg.records import Bool, Float64, OffsetEstimate, Transform
 from meshreg.settings import SiftSettings
 from meshreg.ties.records import TiePoints
-from meshreg.types import Bool, Float64, OffsetEstimate, Transform
 
 PAIRS = 25  # as many as the paper's authors picked at each site
 LEAST = 3  # fewer pairs cannot outvote a wrong one

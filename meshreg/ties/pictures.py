@@ -8,9 +8,9 @@ import numpy as np
 
 from meshreg.errors import InputError
 from meshreg.io.geotiff_write import write_color
+from meshreg.records import Bool, Float64, Grid, Maps, Survey, UInt8
 from meshreg.report.style import hillshade
 from meshreg.settings import RasterSettings
-from meshreg.types import Bool, Float64, Grid, Maps, Survey, UInt8
 
 
 def write_picture(survey: Survey, path: Path, cell: float, settings: RasterSettings) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from meshreg.errors import InputError
-from meshreg.types import Float64, Registration
+from meshreg.records import Float64, Registration
 
 HeightAt = Callable[[Float64], Float64]  # reference points (N, 2) to registered heights (N,) [m]
 

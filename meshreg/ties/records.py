@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from meshreg.errors import UsageError
-from meshreg.types import Float64
+from meshreg.records import Float64
 
 Point = tuple[float, float]
 MAX_PAIRS = 10_000

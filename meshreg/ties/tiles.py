@@ -16,7 +16,7 @@ import numpy as np
 
 from meshreg.errors import InputError
 from meshreg.io.geotiff import lattice, opened
-from meshreg.types import Bool, Float64, Grid, UInt8
+from meshreg.records import Bool, Float64, Grid, UInt8
 
 SIDE = 256  # pixels of a tile
 _ANY_SIZE = 1 << 62

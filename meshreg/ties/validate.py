@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from meshreg.errors import InputError
+from meshreg.records import Float64, OffsetEstimate, Registration, Transform
 from meshreg.statistics import lever
 from meshreg.ties.cover import sectors, weak_spots
 from meshreg.ties.hand import (
@@ -22,7 +23,6 @@ from meshreg.ties.hand import (
 )
 from meshreg.ties.placing import Placing
 from meshreg.ties.records import TiePoints
-from meshreg.types import Float64, OffsetEstimate, Registration, Transform
 
 SCHEMA = "meshreg.validation/1"
 # `refine` turns by up to 1° itself; where the whole turn is more, the survey was turned first

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from meshreg.types import Grid, SurveyRaster, Transform
+from meshreg.records import Grid, SurveyRaster, Transform
 
 PAIRS = 6
 OFFSETS = {
@@ -71,7 +71,7 @@ def one(case: str, changes: dict[str, Any], seed: int) -> dict[str, Any]:
 def there_and_back(there: Any, back: Any) -> float:
     """Largest deviation of the six parameters from nothing, in sigmas of both answers together."""
     from meshreg import statistics
-    from meshreg.decision import covariance_of
+    from meshreg.pipeline.decision import covariance_of
 
     if there.transform is None or back.transform is None:
         return float("nan")
@@ -92,16 +92,15 @@ def warped(
     decision: Any, dems: tuple[SurveyRaster, SurveyRaster], points: tuple[Any, Any]
 ) -> dict[str, Any] | None:
     """Bend a registered pair as `--warp auto` does; residuals at (moving, reference) points [m]."""
-    from meshreg import statistics
-    from meshreg.raster.grid import common_grid
+    from meshreg.deformation.internal import measure
+    from meshreg.raster.grid import common_grid, on_grid
     from meshreg.settings import WarpSettings
-    from meshreg.warp import measure
 
     transform, refined = decision.transform, decision.refined
     if transform is None:
         return None
     grid = common_grid(dems[0].grid, dems[1].grid)
-    reference, moving = statistics.on_grid(dems[0], grid), laid_down(dems[1], grid, transform)
+    reference, moving = on_grid(dems[0], grid), laid_down(dems[1], grid, transform)
     found = measure(refined.tiles, transform, reference, moving, WarpSettings("auto"))
     there = transform.apply(points[0])
     after = there if found.warp is None else found.warp.apply(there)
@@ -118,8 +117,8 @@ def warped(
 def laid_down(dem: SurveyRaster, grid: Grid, transform: Transform) -> SurveyRaster:
     """Lay a DEM down as a surface: a raster alone cannot be tilted."""
     from meshreg.raster import rasterize
+    from meshreg.records import Mesh, Survey
     from meshreg.settings import RasterSettings
-    from meshreg.types import Mesh, Survey
 
     row, col = np.indices(dem.grid.shape)
     height = np.where(dem.valid, dem.height + dem.datum, 0.0)
@@ -186,8 +185,8 @@ def steps_on_a_real_reef() -> list[dict[str, Any]]:
     import rasterio
     from measure import ROOT
 
-    from meshreg.refine import refine
-    from meshreg.types import Grid, SurveyRaster
+    from meshreg.records import Grid, SurveyRaster
+    from meshreg.refine.rigid import refine
 
     with rasterio.open(ROOT / "tests" / "data" / "reef_dem" / "horseshoe_dem.tif") as file:
         fine = file.read(1).astype(np.float64)

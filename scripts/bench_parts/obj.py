@@ -71,7 +71,7 @@ def trimesh(small: str, path: str) -> dict[str, Any]:
 
 
 def open3d(small: str, path: str) -> dict[str, Any]:
-    from meshreg.open3d_loading import load_open3d
+    from meshreg.refine.open3d_loading import load_open3d
 
     return _best(load_open3d().io.read_triangle_mesh, small, path)
 

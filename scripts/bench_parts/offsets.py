@@ -25,7 +25,7 @@ def _noise(rng: np.random.Generator, n: int, sigma: float) -> np.ndarray:
 
 def _pair(seed: int, n: int, cell: float, change: float = 0.3) -> tuple[Any, Any, Any]:
     """Fractal ground; the moving survey is cut elsewhere from it, changed and lit unevenly."""
-    from meshreg.types import Grid, SurveyRaster
+    from meshreg.records import Grid, SurveyRaster
 
     rng = np.random.default_rng(seed)
     margin = int(3.75 / cell)

@@ -152,7 +152,7 @@ def kiss_matcher(pair: Pair) -> np.ndarray:
 
 def open3d_global(pair: Pair) -> np.ndarray:
     """Its "Global registration" tutorial, radii and thresholds in the same ratio to the voxel."""
-    from meshreg.open3d_loading import load_open3d
+    from meshreg.refine.open3d_loading import load_open3d
 
     open3d = load_open3d()
     registration = open3d.pipelines.registration
@@ -319,7 +319,7 @@ def run_tool(path: str, tool: str) -> dict[str, Any]:
     import importlib
     import warnings
 
-    from meshreg.open3d_loading import load_open3d
+    from meshreg.refine.open3d_loading import load_open3d
 
     warnings.simplefilter("ignore")
     if tool in PACKAGES:

@@ -14,13 +14,13 @@ from typing import Any
 import measure
 import numpy as np
 
-from meshreg.open3d_loading import load_open3d
 from meshreg.raster import rasterize
 from meshreg.raster.mesh import draw_mesh
 from meshreg.raster.placing import place
 from meshreg.raster.spacing import measure_spacing
+from meshreg.records import Grid, Mesh, PointCloud, Survey, Texture
+from meshreg.refine.open3d_loading import load_open3d
 from meshreg.settings import RasterSettings
-from meshreg.types import Grid, Mesh, PointCloud, Survey, Texture
 
 
 def textured_reef(faces: int, page: int, size: float) -> Survey:

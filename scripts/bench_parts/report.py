@@ -23,7 +23,7 @@ def job(folder: str) -> dict[str, Any]:
     import meshreg
     from meshreg.benchmark import rasters
     from meshreg.benchmark.plan import Job
-    from meshreg.cli_parts.reporting import keep_evidence, write_report
+    from meshreg.cli.reporting import keep_evidence, write_report
     from meshreg.io.record import write_record_files
 
     def survey(name: str, dem: Any, ortho: Any) -> Any:

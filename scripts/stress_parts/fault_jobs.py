@@ -62,7 +62,7 @@ def make_inputs(folder: Path) -> None:
 
 
 def _sheet(ground: Any, seed: int, name: str) -> Any:
-    from meshreg.types import Mesh, Survey, Texture
+    from meshreg.records import Mesh, Survey, Texture
 
     raster = ground.raster(0.05, 2.0, noise=0.002, seed=seed)
     page = ground.raster(0.02, 2.0, noise=0.0, seed=seed).color
@@ -86,7 +86,7 @@ def _sheet(ground: Any, seed: int, name: str) -> Any:
 
 def _as_cloud(survey: Any, kind: str) -> Any:
     """The survey's points alone where the format has no faces."""
-    from meshreg.types import PointCloud
+    from meshreg.records import PointCloud
 
     if kind not in ("laz", "xyz", "e57"):
         return survey

@@ -165,7 +165,7 @@ class Bench:
             handle = os.open(said, os.O_CREAT | os.O_TRUNC | os.O_WRONLY, 0o600)
             for stream in (1, 2):
                 os.dup2(handle, stream)
-            from meshreg import cli
+            from meshreg.cli import app as cli
 
             if prepare is not None:
                 prepare()
@@ -251,7 +251,7 @@ def paint_quickly() -> None:
 
 def usual(bench: Bench, job: Job) -> Usual:
     """Do a job without a fault, four times: once here, so that the forks are warm."""
-    from meshreg import cli
+    from meshreg.cli import app as cli
 
     command = job.command(bench.inputs, bench.there)
     bench.lay(job)
@@ -420,7 +420,7 @@ def _faulty(bench: Bench, command: list[str], fault: str, k: int, limit: int) ->
 
 def _no_look_at_the_disk() -> None:
     """So that the disk is full in the middle, not found full at the start."""
-    from meshreg.cli_parts import common
+    from meshreg.cli import common
 
     common._ROOM = -1e18
 
@@ -504,7 +504,7 @@ def main() -> int:
 
 
 def _all(bench: Bench, jobs: list[Job], asked: argparse.Namespace) -> int:
-    from meshreg import cli
+    from meshreg.cli import app as cli
 
     bench.inputs.mkdir()
     make_inputs(bench.inputs)

@@ -56,7 +56,7 @@ def write_case(here: Path, files: dict[str, bytes]) -> None:
 
 def run_command(command: tuple[str, ...], main: str, here: Path) -> int:
     """Run one command in this process; return its exit code."""
-    from meshreg import cli
+    from meshreg.cli import app as cli
 
     folder = str(here / "in")
     words = [
@@ -75,7 +75,7 @@ def rewrite(name: str, out: Path) -> int:
 
     from meshreg.errors import MeshregError
     from meshreg.io import read_survey, rewrite_survey
-    from meshreg.types import Transform
+    from meshreg.records import Transform
 
     turn = np.array([[np.cos(0.02), -np.sin(0.02), 0], [np.sin(0.02), np.cos(0.02), 0], [0, 0, 1]])
     options: dict[str, Any] = {}
@@ -321,7 +321,7 @@ def fuzz(
     import rasterio  # noqa: F401
     from PIL import Image  # noqa: F401
 
-    from meshreg import cli  # noqa: F401
+    from meshreg.cli import app as cli  # noqa: F401
 
     workers = [Worker(folder / f"w{k}", seeds) for k in range(said.workers)]
     plain = [(kind, -1, k, 0) for kind in kinds for k in range(len(seeds[kind].commands))]

@@ -199,7 +199,7 @@ def las(name: str, minor: int, form: int) -> dict[str, bytes]:
 def e57() -> dict[str, bytes]:
     """Return an E57 with colours and a pose."""
     from meshreg.io import write_survey
-    from meshreg.types import PointCloud, Survey
+    from meshreg.records import PointCloud, Survey
 
     points, _ = ground()
     cloud = PointCloud(points - points.mean(axis=0), np.full((len(points), 3), 90, np.uint8))
@@ -344,7 +344,7 @@ def masked(name: str) -> tuple[tuple[str, ...], ...]:
 
 def record() -> dict[str, bytes]:
     """Return the folder of a small registration, and what it was made from."""
-    from meshreg import cli
+    from meshreg.cli import app as cli
 
     files = {"ref.tif": tif(n=40), "mov.tif": tif(n=40, shift=1.0)}
     with tempfile.TemporaryDirectory() as folder:

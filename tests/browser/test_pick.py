@@ -19,12 +19,12 @@ import pytest
 from data_synth.rasters import RasterPair, make_rasters
 from data_synth.recipe import load
 from data_synth.truth import common_points
-from meshreg import cli
+from meshreg.cli import app as cli
 from meshreg.io.document import registration_document, to_json
 from meshreg.io.maps import write_raster
+from meshreg.records import OffsetEstimate, Registration, Transform
 from meshreg.settings import Settings
 from meshreg.ties import read_ties
-from meshreg.types import OffsetEstimate, Registration, Transform
 
 OFF = np.array([0.03, -0.04])  # how far the registration that is validated is wrong [m]
 

@@ -13,7 +13,7 @@ import pytest
 from made_registration import EAST, NORTH, OFFSET, made_registration, relief
 from PIL import Image
 
-from meshreg.cli_parts.reporting import keep_evidence, write_report
+from meshreg.cli.reporting import keep_evidence, write_report
 from meshreg.io.record import write_registration
 from meshreg.report import keeping
 

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from meshreg.errors import InputError, MeshregError, OutputError
 from meshreg.io import read_survey, rewrite_survey, write_survey
-from meshreg.types import Frame, PointCloud, SourceFile, Survey, Transform
+from meshreg.records import Frame, PointCloud, SourceFile, Survey, Transform
 from tests.reference_io import utm
 
 DATA = Path(__file__).parent.parent / "data" / "las"

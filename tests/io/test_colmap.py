@@ -19,7 +19,7 @@ from meshreg.errors import InputError, OutputError, UsageError
 from meshreg.io import colmap, colmap_files, positions, similarity
 from meshreg.io.mover import make_mover
 from meshreg.io.options import ReadOptions
-from meshreg.types import Frame, Survey, Transform
+from meshreg.records import Frame, Survey, Transform
 
 DATA = Path(__file__).parents[1] / "data" / "colmap"
 

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from meshreg.io.directions import Directions, find_directions, turn_columns
 from meshreg.io.mover import make_mover
-from meshreg.types import Frame, SourceFile, Transform
+from meshreg.records import Frame, SourceFile, Transform
 
 RNG = np.random.default_rng(31)
 REST = tuple(f"f_rest_{k}" for k in range(45))
@@ -149,7 +149,7 @@ def test_splats_look_the_same_from_the_turned_place(degree, mirrored):
 @pytest.mark.parametrize("suffix", [".obj", ".stl", ".ply", ".csv"])
 def test_a_bend_that_turns_no_direction_is_said(tmp_path, suffix, caplog):
     from meshreg.io import read_survey, rewrite_survey, write_survey
-    from meshreg.types import Mesh, Survey, Warp
+    from meshreg.records import Mesh, Survey, Warp
 
     path = tmp_path / f"a{suffix}"
     points = RNG.uniform(0, 9, (30, 3))

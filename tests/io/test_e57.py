@@ -13,7 +13,7 @@ from meshreg.errors import InputError, OutputError, UnsafeReferenceError, UsageE
 from meshreg.io import e57, e57_pages, e57_scans, e57_xml
 from meshreg.io.mover import make_mover
 from meshreg.io.options import ReadOptions
-from meshreg.types import Frame, Mesh, PointCloud, Survey, Transform
+from meshreg.records import Frame, Mesh, PointCloud, Survey, Transform
 
 DATA = Path(__file__).parents[1] / "data" / "e57"
 NS = "http://www.astm.org/COMMIT/E57/2010-e57-v1.0"

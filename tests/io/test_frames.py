@@ -33,7 +33,7 @@ from meshreg.io.frames import (
     to_file,
 )
 from meshreg.io.options import ReadOptions
-from meshreg.types import Frame, PointCloud, SourceFile, Survey, Transform
+from meshreg.records import Frame, PointCloud, SourceFile, Survey, Transform
 from tests.reference_io import scale_and_convergence, utm
 
 BEACH = (731_500.0, 5_705_400.0, 3.0)  # EPSG:32754, Victoria

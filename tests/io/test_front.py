@@ -28,7 +28,7 @@ from meshreg.io import (
     write_survey,
 )
 from meshreg.io.merging import merge
-from meshreg.types import Mesh, PointCloud, Survey, Texture, Transform
+from meshreg.records import Mesh, PointCloud, Survey, Texture, Transform
 
 DATA = Path(__file__).parent.parent / "data"
 SQUARE = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0.5], [0, 1, 0.25]])

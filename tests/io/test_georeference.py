@@ -13,7 +13,7 @@ import trimesh
 
 from meshreg.errors import InputError
 from meshreg.io import read_survey, rewrite_survey
-from meshreg.types import Transform
+from meshreg.records import Transform
 
 SHIFT = (731_000.0, 5_705_000.0, 12.5)
 CRS = "EPSG:32754"
@@ -461,7 +461,7 @@ def test_maps_made_of_a_survey_are_in_its_local_crs(tmp_path, unit, carried):
     import rasterio
     from made_registration import made_registration
 
-    from meshreg import cli
+    from meshreg.cli import app as cli
     from meshreg.io import ReadOptions
     from meshreg.io.record import write_record_files
 

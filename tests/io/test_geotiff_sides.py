@@ -10,7 +10,7 @@ from rasterio.crs import CRS
 
 from meshreg.errors import InputError, UnsafeReferenceError
 from meshreg.io import read_survey, rewrite_survey
-from meshreg.types import Transform
+from meshreg.records import Transform
 
 HEIGHT = (np.arange(120, dtype=np.float32).reshape(10, 12) % 17) / 4 + 20
 PLACE = Affine(0.5, 0, 731_000, 0, -0.5, 5_705_000)

@@ -24,7 +24,7 @@ from meshreg.io.frames import make_mover
 from meshreg.io.gltf import read, rewrite, write
 from meshreg.io.images import open_texture_bytes, texture_from_array
 from meshreg.io.options import ReadOptions
-from meshreg.types import Frame, Grid, Maps, Mesh, PointCloud, Survey, Transform
+from meshreg.records import Frame, Grid, Maps, Mesh, PointCloud, Survey, Transform
 
 # A slope of the seafloor, Y-up as the format wants it: x east, y up, z south.
 POINTS = np.array([[0, 0.5, 0], [4, 0.25, 0], [4, 0, -3], [0, 1, -3]], np.float32)

@@ -21,7 +21,7 @@ from rasterio import Affine
 
 from meshreg.errors import InputError, ResourceLimitError
 from meshreg.io import cloud, decoding, read_survey, rewrite_survey, safe
-from meshreg.types import Transform
+from meshreg.records import Transform
 
 DATA = Path(__file__).parent.parent / "data" / "hostile"
 MOVE = Transform(offset=np.array([1.5, -0.5, 0.25]))
@@ -365,7 +365,7 @@ def test_what_is_in_proportion_is_read(needed, n_bytes):
 def test_pages_of_few_bytes_are_not_decoded_all_at_once():
     from meshreg.io.images import EncodedImage
     from meshreg.raster.textures import plan_pages
-    from meshreg.types import Mesh, Texture
+    from meshreg.records import Mesh, Texture
 
     vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0.0]])
     faces = np.tile(np.arange(3, dtype=np.int32), (8, 1))

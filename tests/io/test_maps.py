@@ -19,7 +19,15 @@ from meshreg.errors import InputError, OutputError, ResourceLimitError, UsageErr
 from meshreg.io import geotiff, geotiff_write, maps, regrid
 from meshreg.io.mover import make_mover
 from meshreg.io.options import ReadOptions
-from meshreg.types import Frame, Grid, Maps, PointCloud, Survey, SurveyRaster, Transform
+from meshreg.records import (
+    Frame,
+    Grid,
+    Maps,
+    PointCloud,
+    Survey,
+    SurveyRaster,
+    Transform,
+)
 from tests import reference_regrid
 
 WEST, NORTH = 500000.0, 6000040.0

@@ -17,7 +17,7 @@ from rasterio import Affine
 
 from meshreg.errors import InputError
 from meshreg.io import mask_polygons, masks
-from meshreg.types import Frame, Grid, PointCloud, SourceFile, Survey
+from meshreg.records import Frame, Grid, PointCloud, SourceFile, Survey
 
 CRS = "EPSG:32754"
 # Corners that lie on no cell centre and on no line through them.

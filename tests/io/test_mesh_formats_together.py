@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from meshreg.io import read_survey, rewrite_survey, write_survey
-from meshreg.types import Mesh, Survey, Transform
+from meshreg.records import Mesh, Survey, Transform
 
 ORIGIN = np.array([512345.25, 6012345.5, -20.0])
 MOVE = Transform(offset=(13.4, -8.7, 1.25))

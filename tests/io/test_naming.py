@@ -15,7 +15,7 @@ from PIL import Image
 from meshreg.errors import InputError
 from meshreg.io import read_survey, require_writable, rewrite_survey
 from meshreg.io.naming import planned
-from meshreg.types import SourceFile, Survey, Transform
+from meshreg.records import SourceFile, Survey, Transform
 
 COLOURS = [(250, 10, 20), (30, 240, 50), (60, 70, 230)]
 MOVE = Transform(offset=np.array([1.0, 2.0, 0.5]))
@@ -202,7 +202,7 @@ def test_the_longest_names_are_written(tmp_path, letter):
 
 def glb(path, extent, crs):
     from meshreg.io import write_survey
-    from meshreg.types import Mesh
+    from meshreg.records import Mesh
 
     points = np.array([[0, 0, 0], [extent, 0, 1], [extent, extent, 0], [0, extent, 2]], float)
     mesh = Mesh(points - [extent / 2, extent / 2, 0], np.array([[0, 1, 2], [0, 2, 3]]))

@@ -17,7 +17,7 @@ from meshreg.io import line_blocks
 from meshreg.io.obj import read
 from meshreg.io.obj_scan import scan
 from meshreg.io.options import ReadOptions
-from meshreg.types import Mesh, PointCloud
+from meshreg.records import Mesh, PointCloud
 
 SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0.5\nv 0 1 0\n"
 CORNERS = "vt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n"

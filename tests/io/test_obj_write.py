@@ -19,7 +19,7 @@ from meshreg.io.images import open_texture, texture_from_array
 from meshreg.io.mover import make_mover
 from meshreg.io.obj import read, rewrite, write
 from meshreg.io.options import ReadOptions
-from meshreg.types import Frame, Grid, Maps, Mesh, PointCloud, Survey, Transform
+from meshreg.records import Frame, Grid, Maps, Mesh, PointCloud, Survey, Transform
 
 FILE_CASES = settings(
     max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]

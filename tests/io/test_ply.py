@@ -17,7 +17,7 @@ from meshreg.errors import InputError, UnsafeReferenceError, UsageError
 from meshreg.io.frames import make_mover
 from meshreg.io.options import ReadOptions
 from meshreg.io.ply import read, rewrite, write
-from meshreg.types import Frame, Maps, Mesh, PointCloud, Survey, Transform
+from meshreg.records import Frame, Maps, Mesh, PointCloud, Survey, Transform
 
 XYZ = [("x", "double"), ("y", "double"), ("z", "double")]
 INDICES = ("vertex_indices", ("uchar", "int"))
@@ -863,7 +863,7 @@ def test_what_is_written_reads_back_the_same(tmp_path_factory, seed, colored, n_
 
 
 def test_maps_are_not_written_as_ply(tmp_path):
-    from meshreg.types import Grid
+    from meshreg.records import Grid
 
     maps = Maps(np.zeros((2, 2), np.float32), Grid(0, 2, 1, (2, 2)))
     with pytest.raises(UsageError):

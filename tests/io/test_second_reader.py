@@ -13,7 +13,7 @@ from meshreg.errors import OutputError
 from meshreg.io import obj_write, read_survey, rewrite_survey, second_reader, write_survey
 from meshreg.io.cloud_write import _LOST
 from meshreg.io.mover import make_mover
-from meshreg.types import Mesh, PointCloud, Survey, Transform
+from meshreg.records import Mesh, PointCloud, Survey, Transform
 
 C, S = math.cos(0.4), math.sin(0.4)
 MOVE = Transform(np.array([[C, -S, 0], [S, C, 0], [0, 0, 1]]), offset=(3, -2, 1))

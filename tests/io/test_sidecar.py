@@ -12,7 +12,7 @@ from meshreg.errors import InputError, OutputError
 from meshreg.io.frames import NED, Y_UP, frame_from
 from meshreg.io.options import ReadOptions
 from meshreg.io.sidecar import SidecarInfo, find_sidecar, is_sidecar, write_shift
-from meshreg.types import Frame
+from meshreg.records import Frame
 
 CENTRE = (500.0, 400.0, 3.0)  # file coordinates; with the shift they lie in zone 54 south
 SHIFT = (731000.0, 5705000.0, 0.0)

@@ -11,7 +11,7 @@ from meshreg.errors import InputError, UsageError
 from meshreg.io import off, stl
 from meshreg.io.frames import make_mover
 from meshreg.io.options import ReadOptions
-from meshreg.types import Mesh, PointCloud, Survey, Transform
+from meshreg.records import Mesh, PointCloud, Survey, Transform
 
 POINTS = np.array([[0, 0, 0.5], [4, 0, 0.25], [4, 3, 0], [0, 3, 1.0]])
 FACES = np.array([[0, 1, 2], [0, 2, 3]])

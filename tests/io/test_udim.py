@@ -9,7 +9,7 @@ from PIL import Image
 from meshreg.io import read_survey, rewrite_survey
 from meshreg.io.udim import first_tile, has_token, tile_pages
 from meshreg.raster import rasterize
-from meshreg.types import Grid, Transform
+from meshreg.records import Grid, Transform
 
 COLOURS = {(0, 0): (250, 10, 20), (1, 0): (30, 240, 50), (3, 1): (60, 70, 230)}
 NAMES = {

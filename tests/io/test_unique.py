@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from meshreg.io import read_survey, rewrite_survey, unique, write_survey
 from meshreg.raster.grid import choose_cells
-from meshreg.types import Mesh, PointCloud, Survey, Transform
+from meshreg.records import Mesh, PointCloud, Survey, Transform
 
 UTM = np.array([731_000.0, 5_705_000.0, -12.0])
 

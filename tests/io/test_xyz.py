@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from meshreg.errors import InputError, MeshregError, OutputError
 from meshreg.io import read_survey, rewrite_survey, write_survey
 from meshreg.io.xyz_kernels import count_rows, parse_rows, splice_rows
-from meshreg.types import Frame, PointCloud, SourceFile, Survey, Transform
+from meshreg.records import Frame, PointCloud, SourceFile, Survey, Transform
 from tests.reference_io import fields_of, rows_of, spliced, utm
 
 POINTS = [[1.5, 2.25, 3.0], [4.0, -5.5, 6.125]]

@@ -12,8 +12,8 @@ import seafloor
 from meshreg.errors import UsageError
 from meshreg.offsets import ESTIMATORS, estimate_offset
 from meshreg.offsets import sift as sift_module
+from meshreg.records import SurveyRaster
 from meshreg.settings import Settings, SiftSettings
-from meshreg.types import SurveyRaster
 
 OFFSET = (1.237, -2.412)
 METHODS = tuple(ESTIMATORS)

@@ -10,10 +10,10 @@ import pytest
 import seafloor
 from scipy.stats import chi2
 
-from meshreg.kriging import Ground
 from meshreg.offsets import ESTIMATORS, error_bars, estimate_offset
+from meshreg.records import Grid
 from meshreg.settings import Settings
-from meshreg.types import Grid
+from meshreg.statistics.kriging import Ground
 
 SEEDS = {"sift": range(8), "terrain": range(20), "mutual_information": range(20)}
 STRONG = 0.12  # m

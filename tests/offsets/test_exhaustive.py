@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from meshreg.errors import UsageError
 from meshreg.offsets import mutual_information, terrain
 from meshreg.offsets.correlate import Correlator, Window
-from meshreg.types import Grid, SurveyRaster
+from meshreg.records import Grid, SurveyRaster
 
 
 def raster(seed, shape=(17, 23), cell=0.1, west=0.0, north=0.0, datum=0.0, holes=0.15):

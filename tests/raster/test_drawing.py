@@ -16,8 +16,8 @@ from meshreg.raster.grid import survey_grid
 from meshreg.raster.mesh import draw_mesh, samples_per_side
 from meshreg.raster.placing import place
 from meshreg.raster.spacing import Spacing
+from meshreg.records import Grid, Mesh, Survey, Transform
 from meshreg.settings import RasterSettings
-from meshreg.types import Grid, Mesh, Survey, Transform
 
 PLAIN = RasterSettings(fill_cells=0, remove_floaters=False, mask_flat_color=False)
 

@@ -11,8 +11,8 @@ from reference_raster import draped, sheet
 
 from meshreg.errors import UsageError
 from meshreg.raster import rasterize
+from meshreg.records import Grid, Mesh, Transform
 from meshreg.settings import RasterSettings
-from meshreg.types import Grid, Mesh, Transform
 
 NO_FILL = RasterSettings(fill_cells=0)
 

@@ -9,8 +9,8 @@ import pytest
 from reference_raster import several, sheet
 
 from meshreg.raster import rasterize
+from meshreg.records import Grid, Mesh, PointCloud, Survey
 from meshreg.settings import RasterSettings
-from meshreg.types import Grid, Mesh, PointCloud, Survey
 
 
 def bed(size=8.0, step=0.05, seed=0):

@@ -24,8 +24,16 @@ from meshreg.raster.grid import (
     survey_bounds,
     survey_grid,
 )
+from meshreg.records import (
+    Grid,
+    Maps,
+    Mesh,
+    PointCloud,
+    Survey,
+    SurveyRaster,
+    Transform,
+)
 from meshreg.settings import RasterSettings
-from meshreg.types import Grid, Maps, Mesh, PointCloud, Survey, SurveyRaster, Transform
 
 
 def cloud(spacing, size=20.0, seed=0, colors=False):

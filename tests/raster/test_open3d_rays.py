@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from reference_raster import several, sheet
 
-from meshreg.open3d_loading import load_open3d
 from meshreg.raster.mesh import draw_mesh
 from meshreg.raster.placing import place
 from meshreg.raster.spacing import Spacing
+from meshreg.records import Grid, Survey
+from meshreg.refine.open3d_loading import load_open3d
 from meshreg.settings import RasterSettings
-from meshreg.types import Grid, Survey
 
 PLAIN = RasterSettings(fill_cells=0, remove_floaters=False)
 

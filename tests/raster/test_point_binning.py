@@ -13,8 +13,8 @@ from scipy.ndimage import binary_dilation
 
 from meshreg.raster import cloud as module
 from meshreg.raster import rasterize
+from meshreg.records import Grid, PointCloud, Survey, Transform
 from meshreg.settings import RasterSettings
-from meshreg.types import Grid, PointCloud, Survey, Transform
 
 PLAIN = RasterSettings(fill_cells=0, remove_floaters=False)
 

@@ -10,8 +10,8 @@ from reference_raster import maps_raster
 
 from meshreg.errors import UsageError
 from meshreg.raster import rasterize
+from meshreg.records import Grid, Maps, Survey, Transform
 from meshreg.settings import RasterSettings
-from meshreg.types import Grid, Maps, Survey, Transform
 
 PLAIN = RasterSettings(fill_cells=0)
 

@@ -12,8 +12,8 @@ from meshreg.raster import rasterize
 from meshreg.raster.mesh import draw_mesh
 from meshreg.raster.placing import place
 from meshreg.raster.spacing import Spacing
+from meshreg.records import Grid, Mesh, Survey, Transform
 from meshreg.settings import RasterSettings
-from meshreg.types import Grid, Mesh, Survey, Transform
 
 DEM = Path(__file__).parents[1] / "data" / "reef_dem" / "horseshoe_crop.tif"
 SHIFTS = [(0.5, 0.5), (0.25, 0.0), (0.0, 0.33), (0.37, 0.71), (0.05, 0.95), (0.62, 0.18)]

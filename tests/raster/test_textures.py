@@ -15,8 +15,8 @@ from meshreg.errors import InputError
 from meshreg.raster import rasterize, textures
 from meshreg.raster.mesh import samples_per_side
 from meshreg.raster.spacing import Spacing, measure_spacing
+from meshreg.records import Grid, Mesh, Survey, Texture
 from meshreg.settings import RasterSettings
-from meshreg.types import Grid, Mesh, Survey, Texture
 
 PLAIN = RasterSettings(fill_cells=0, remove_floaters=False, mask_flat_color=False)
 

@@ -14,7 +14,7 @@ from data_synth.make import FORMATS, make_pair, make_rasters, write_pair
 from data_synth.recipe import load
 from meshreg.errors import UsageError
 from meshreg.io import read_survey
-from meshreg.types import Mesh, PointCloud
+from meshreg.records import Mesh, PointCloud
 
 SMALL = {
     "output.texture": 0.02,

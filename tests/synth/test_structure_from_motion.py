@@ -19,8 +19,8 @@ from data_synth.make import write_pair
 from data_synth.recipe import load
 from meshreg.io import read_survey
 from meshreg.io.options import ReadOptions
-from meshreg.pipeline import register_pair
-from meshreg.types import PointCloud, Survey
+from meshreg.pipeline.register import register_pair
+from meshreg.records import PointCloud, Survey
 
 
 def reconstruct(photographs: Path, work: Path) -> Path:

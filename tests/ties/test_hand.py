@@ -15,10 +15,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_registration import EAST, NORTH, made_registration
 
-from meshreg import cli, decision
+from meshreg.cli import app as cli
 from meshreg.errors import InputError
 from meshreg.io import document as document_module
 from meshreg.io.document import read_registration, registration_document, to_json
+from meshreg.judge.verdict import findings
+from meshreg.pipeline import decision
+from meshreg.records import OffsetEstimate, Transform
 from meshreg.settings import Settings, SiftSettings
 from meshreg.ties import TiePair, TiePoints, hand_registration, ties_estimate, write_ties
 from meshreg.ties.cover import sectors, weak_spots
@@ -26,8 +29,6 @@ from meshreg.ties.hand import free_hand, turn_degrees
 from meshreg.ties.page import sentence
 from meshreg.ties.placing import Placing
 from meshreg.ties.validate import validate
-from meshreg.types import OffsetEstimate, Transform
-from meshreg.verdict import findings
 
 OFFSET = np.array([1.7, -0.9])
 

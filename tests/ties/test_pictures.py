@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from meshreg.io.geotiff_write import write_height
+from meshreg.records import Grid, Maps, PointCloud, Survey
 from meshreg.settings import RasterSettings
 from meshreg.ties import server
 from meshreg.ties.pictures import write_picture, write_relief
 from meshreg.ties.tiles import TileSource
-from meshreg.types import Grid, Maps, PointCloud, Survey
 
 SETTINGS = RasterSettings()
 

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from made_registration import made_registration
 
-from meshreg import cli
-from meshreg.cli_parts.common import SurveyRequest
-from meshreg.cli_parts.console import Voice
-from meshreg.cli_parts.picking import PickRequest, _desk
+from meshreg.cli import app as cli
+from meshreg.cli.common import SurveyRequest
+from meshreg.cli.console import Voice
+from meshreg.cli.picking import PickRequest, _desk
 from meshreg.io.options import ReadOptions
 from meshreg.io.record import write_registration
 from meshreg.ties.placing import read_placing

@@ -20,10 +20,11 @@ from made_registration import made_registration
 from PIL import Image
 from starlette.testclient import TestClient
 
-from meshreg import cli
+from meshreg.cli import app as cli
 from meshreg.errors import InputError, OutputError, UsageError
 from meshreg.io.document import registration_document, to_json
 from meshreg.io.maps import write_raster
+from meshreg.records import Grid, SurveyRaster
 from meshreg.ties import TiePair, TiePoints, read_ties, write_ties
 from meshreg.ties.desk import Desk, Link
 from meshreg.ties.guard import Guard
@@ -31,7 +32,6 @@ from meshreg.ties.placing import Placing
 from meshreg.ties.server import PickServer, make_app
 from meshreg.ties.session import Session, StaleError, only_one
 from meshreg.ties.tiles import SIDE, TileSource, overlap_points
-from meshreg.types import Grid, SurveyRaster
 
 PORT = 8123
 HOME = f"http://127.0.0.1:{PORT}"

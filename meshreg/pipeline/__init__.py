@@ -1,0 +1,39 @@
+"""From a pair of surveys to a registration: the way data flows.
+
+Rasters of both (`levels`), the methods' proposals of Bryson et al. (2013) judged and refined
+(`decision`), and the record (`register`); a check on the user's own data (`selftest`).
+"""
+
+from meshreg.pipeline.decision import (
+    Decision,
+    Manual,
+    covariance_of,
+    decide,
+)
+from meshreg.pipeline.posture import (
+    in_degrees,
+    level_axes,
+    posture,
+)
+from meshreg.pipeline.register import (
+    register_pair,
+    require_different,
+    versions,
+)
+from meshreg.pipeline.selftest import (
+    self_test,
+)
+
+__all__ = [
+    "Decision",
+    "Manual",
+    "covariance_of",
+    "decide",
+    "in_degrees",
+    "level_axes",
+    "posture",
+    "register_pair",
+    "require_different",
+    "self_test",
+    "versions",
+]

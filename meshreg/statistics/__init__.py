@@ -1,0 +1,43 @@
+"""Robust statistics: scale, covariance, fits that predict what they have not seen, kriging."""
+
+from meshreg.statistics.covariance import (
+    lever,
+    registration_error,
+    registration_sigma,
+)
+from meshreg.statistics.held_out import (
+    RAYLEIGH,
+    groups_of,
+    robust,
+    steadiest,
+)
+from meshreg.statistics.kriging import (
+    Ground,
+    best_motion,
+    design,
+    overlap_ground,
+)
+from meshreg.statistics.sandwich import (
+    block_sandwich,
+)
+from meshreg.statistics.scale import (
+    MAD_TO_SIGMA,
+    nmad,
+)
+
+__all__ = [
+    "MAD_TO_SIGMA",
+    "RAYLEIGH",
+    "Ground",
+    "best_motion",
+    "block_sandwich",
+    "design",
+    "groups_of",
+    "lever",
+    "nmad",
+    "overlap_ground",
+    "registration_error",
+    "registration_sigma",
+    "robust",
+    "steadiest",
+]
