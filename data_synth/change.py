@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from data_synth import types as t
 from data_synth.colonies import candidates, make_features, set_reach, uniform
-from data_synth.seafloor import Seafloor, Site
+from data_synth.seafloor import Seafloor
+from data_synth.sites import Site
 from meshreg.errors import UsageError
 
 Rows = NDArray[np.void]

@@ -16,7 +16,7 @@ from data_synth import types as t
 from data_synth.texture import choose_colors
 
 if TYPE_CHECKING:
-    from data_synth.seafloor import Site
+    from data_synth.sites import Site
 
 Float64 = NDArray[np.float64]
 SQUARE = 4.0  # side of a square of the chessboard [m]

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from data_synth.change import Change
-from data_synth.seafloor import SITES, Site
 from data_synth.seeing import Seeing
 from data_synth.sfm import Sfm
+from data_synth.sites import SITES, Site
 from meshreg.errors import UsageError
 from meshreg.settings import Settings
 from meshreg.settings.checked import parse_toml, read_toml, shown

@@ -17,7 +17,8 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-from data_synth.seafloor import SITES, make_seafloor
+from data_synth.seafloor import make_seafloor
+from data_synth.sites import SITES
 
 SIDE, CELL = 8.0, 0.01
 

@@ -54,9 +54,15 @@ def room_of(module: str) -> str:
     return parts[1] if len(parts) > 1 else "__init__"
 
 
+def _is_typing(test: ast.expr) -> bool:
+    return isinstance(test, ast.Name) and test.id == "TYPE_CHECKING"
+
+
 def imported(path: Path, *, top_only: bool = False) -> Iterator[tuple[str, int]]:
     """Give every module that a file imports, with the line; relative ones made absolute."""
     tree = ast.parse(path.read_text(encoding="utf-8"), str(path))
+    if path.name == "__init__.py":  # names for the type checker alone: a front door is lazy
+        tree.body = [n for n in tree.body if not (isinstance(n, ast.If) and _is_typing(n.test))]
     for node in tree.body if top_only else ast.walk(tree):
         if isinstance(node, ast.Import):
             for alias in node.names:

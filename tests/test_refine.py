@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import seafloor
 
-from meshreg.heading.turning import as_delivered
 from meshreg.judge.verdict import MOST_UNDECIDED
+from meshreg.pipeline.turned import as_delivered
 from meshreg.records import Grid, SurveyRaster, Transform
 from meshreg.refine.rigid import (
     Refined,

@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 
 from data_synth.recipe import Recipe, load, scenarios
-from data_synth.seafloor import SITES
+from data_synth.sites import SITES
 from data_synth.truth import GENERATOR
 from meshreg import __version__
 from meshreg.errors import UsageError

@@ -69,7 +69,8 @@ def new_folder(new: NewFolder, unfinished: Unfinished) -> Iterator[Path]:
 
     That the folder can be written and the disk is not full is found out here, before the work.
     """
-    from meshreg.io.atomic import as_output_error, atomic_folder
+    from meshreg.io.atomic import as_output_error
+    from meshreg.io.folders import atomic_folder
     from meshreg.io.manifest import require_apart
 
     with as_output_error(new.out):

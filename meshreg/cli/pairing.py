@@ -11,7 +11,7 @@ import numpy as np
 from meshreg.cli.common import SurveyRequest
 from meshreg.cli.info import plane, remarks
 from meshreg.errors import ResourceLimitError, UsageError
-from meshreg.io.framing import UNITS
+from meshreg.io.axes import UNITS
 from meshreg.pipeline import in_degrees
 from meshreg.records import Float64, Maps, Registration, Survey
 from meshreg.settings import Settings

@@ -1,18 +1,18 @@
 """READ and WRITE: the only place that opens a survey file.
 
-`READERS`, `WRITERS` and `REWRITERS` are the tables of formats; a new format is one module and its
-lines here. Each entry names a function by "module:function", imported at first use.
+`formats` has the tables of what is read, written and rewritten by which module.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import importlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from meshreg.errors import InputError, UsageError
+from meshreg.io.formats import CHECKS, READERS, REWRITERS, WRITERS, load
 from meshreg.io.options import ReadOptions
 
 if TYPE_CHECKING:
@@ -20,72 +20,11 @@ if TYPE_CHECKING:
     from meshreg.io.record import write_registration as write_registration
     from meshreg.records import Survey, Transform, Warp
 
-READERS: dict[str, str] = {
-    ".obj": "meshreg.io.obj:read",
-    ".ply": "meshreg.io.ply:read",
-    ".glb": "meshreg.io.gltf:read",
-    ".gltf": "meshreg.io.gltf:read",
-    ".stl": "meshreg.io.stl:read",
-    ".off": "meshreg.io.off:read",
-    ".las": "meshreg.io.cloud:read",
-    ".laz": "meshreg.io.cloud:read",
-    ".e57": "meshreg.io.e57:read",
-    ".xyz": "meshreg.io.xyz:read",
-    ".csv": "meshreg.io.xyz:read",
-    ".txt": "meshreg.io.xyz:read",
-    ".asc": "meshreg.io.xyz:read",
-    ".pts": "meshreg.io.xyz:read",
-    ".tif": "meshreg.io.maps:read",
-    ".tiff": "meshreg.io.maps:read",
-    "": "meshreg.io.colmap:read",  # a folder
-}
-WRITERS: dict[str, str] = {
-    ".obj": "meshreg.io.obj:write",
-    ".ply": "meshreg.io.ply:write",
-    ".glb": "meshreg.io.gltf:write",
-    ".stl": "meshreg.io.stl:write",
-    ".off": "meshreg.io.off:write",
-    ".las": "meshreg.io.cloud:write",
-    ".laz": "meshreg.io.cloud:write",
-    ".e57": "meshreg.io.e57:write",
-    ".xyz": "meshreg.io.xyz:write",
-    ".csv": "meshreg.io.xyz:write",
-    ".txt": "meshreg.io.xyz:write",
-    ".tif": "meshreg.io.maps:write",
-    ".tiff": "meshreg.io.maps:write",
-}
-REWRITERS: dict[str, str] = {
-    "obj": "meshreg.io.obj:rewrite",
-    "ply": "meshreg.io.ply:rewrite",
-    "glb": "meshreg.io.gltf:rewrite",
-    "gltf": "meshreg.io.gltf:rewrite",
-    "stl": "meshreg.io.stl:rewrite",
-    "off": "meshreg.io.off:rewrite",
-    "las": "meshreg.io.cloud:rewrite",
-    "e57": "meshreg.io.e57:rewrite",
-    "xyz": "meshreg.io.xyz:rewrite",
-    "colmap": "meshreg.io.colmap:rewrite",
-    "maps": "meshreg.io.maps:rewrite",
-}
-# What is found out about a file before the work that could otherwise fail at its end.
-CHECKS: dict[str, str] = {
-    "glb": "meshreg.io.gltf_rewrite:require_writable",
-    "gltf": "meshreg.io.gltf_rewrite:require_writable",
-    "colmap": "meshreg.io.colmap:require_writable",
-}
-
 
 def __getattr__(name: str) -> Any:
     if name in ("read_registration", "write_registration"):
         return getattr(importlib.import_module("meshreg.io.record"), name)
     raise AttributeError(f"module 'meshreg.io' has no attribute {name!r}")
-
-
-def load(entry: str) -> Callable[..., Any]:
-    """Import the function that a table's "module:function" names."""
-    module, _, name = entry.partition(":")
-    function: Callable[..., Any] = getattr(importlib.import_module(module), name)
-    return function
 
 
 def read_survey(

@@ -10,8 +10,8 @@ from typing import cast
 import numpy as np
 
 from meshreg.errors import InputError, OutputError, UsageError
-from meshreg.io import CHECKS, READERS, REWRITERS, load
 from meshreg.io.finding import Block, find_blocks
+from meshreg.io.formats import CHECKS, READERS, REWRITERS, load
 from meshreg.io.frames import make_mover, registered_frame, to_file
 from meshreg.io.mover import Mover, is_plain
 from meshreg.io.naming import Planned, planned

@@ -1,4 +1,4 @@
-"""READ LAS, LAZ and COPC by laspy, in chunks. Writing and rewriting are in `cloud_write`."""
+"""READ LAS, LAZ and COPC by laspy, in chunks; `cloud_write` writes and rewrites them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from meshreg.errors import InputError
 from meshreg.io.assemble import Found, placed_survey
 from meshreg.io.classes import BED, NOISE, OLD_WATER, RECLASS, WATER, class_notes, in_classes
-from meshreg.io.cloud_write import rewrite, write
 from meshreg.io.frames import place
 from meshreg.io.las_extra import extra_directions
 from meshreg.io.las_header import LasHead, check_header, file_crs
@@ -25,8 +24,6 @@ from meshreg.io.options import ReadOptions
 from meshreg.io.safe import open_regular
 from meshreg.io.sidecar import find_sidecar
 from meshreg.records import Bool, Float64, PointCloud, Survey, UInt8
-
-__all__ = ["read", "rewrite", "write"]
 
 _LOG = logging.getLogger("meshreg")
 _CHUNK_BYTES = 64_000_000

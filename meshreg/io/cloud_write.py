@@ -12,13 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from meshreg.errors import OutputError, UsageError
+from meshreg.io.atomic import atomic_file
+from meshreg.io.cloud import opened
 from meshreg.io.directions import Directions, bend_note
 from meshreg.io.las_extra import extra_directions, turn_extra
 from meshreg.io.las_header import CRS_RECORDS, check_header
 from meshreg.io.laz_chunks import las_errors
 from meshreg.io.mover import Mover, is_plain
 from meshreg.io.rewriting import require_unchanged, warn
-from meshreg.io.safe import atomic_file, open_regular
+from meshreg.io.safe import open_regular
 from meshreg.io.second_reader import require_las
 from meshreg.records import Float64, PointCloud, SourceFile, Survey
 
@@ -89,8 +91,6 @@ def rewrite(source: SourceFile, move: Mover, path: Path) -> tuple[Path, ...]:
     OutputError
         Not written, or not what was meant when read back.
     """
-    from meshreg.io.cloud import opened
-
     require_unchanged(source, path)
     head = check_header(source.path)
     with las_errors(source.path), opened(source.path) as reader:
@@ -276,8 +276,6 @@ def _check(
     written: Path, path: Path, sums: list[tuple[int, int]], ends: Float64, n_evlrs: int
 ) -> None:
     """Read every record back (lazrs once wrote damaged LAZ, laz-rs #51)."""
-    from meshreg.io.cloud import opened
-
     head = check_header(written)
     again, extent = [], _Ends()
     with las_errors(path, OutputError), opened(written) as reader:

@@ -19,11 +19,12 @@ from meshreg.io.bridge import bridge
 from meshreg.io.colmap_files import PARTS, Model, ModelFiles, find_model, read_model
 from meshreg.io.colmap_write import ModelMove, check_moved, text_kept, write_moved
 from meshreg.io.crs import crs_name, crs_text, is_geographic, metric_crs
+from meshreg.io.folders import atomic_folder
 from meshreg.io.frames import Placed, place, require_near
 from meshreg.io.mover import Mover
 from meshreg.io.options import ReadOptions
 from meshreg.io.positions import Positions, exif_positions, match_names, read_positions
-from meshreg.io.safe import FARTHEST, atomic_folder, fingerprint, open_regular
+from meshreg.io.safe import FARTHEST, fingerprint, open_regular
 from meshreg.io.sidecar import SidecarInfo, find_sidecar
 from meshreg.io.similarity import (
     MAX_TILT,

@@ -16,8 +16,9 @@ from pathlib import Path
 import numpy as np
 
 from meshreg.errors import OutputError
+from meshreg.io.atomic import copy_file
 from meshreg.io.colmap_files import Model, ModelFiles, binary_places
-from meshreg.io.safe import copy_file, file_bytes, open_regular
+from meshreg.io.safe import file_bytes, open_regular
 from meshreg.records import Float64
 
 _POSE = re.compile(rb"(\s*\d+[ \t]+)((?:\S+[ \t]+){6}\S+)(.*)", re.DOTALL)  # of an image

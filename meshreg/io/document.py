@@ -17,6 +17,7 @@ import numpy as np
 
 from meshreg.errors import InputError, UsageError
 from meshreg.io.checked_json import parse_json, require_schema
+from meshreg.io.safe import open_regular
 from meshreg.records import Finding, OffsetEstimate, Registration, Transform, Warp
 from meshreg.settings.checked import shown
 
@@ -187,8 +188,6 @@ def read_registration(path: str | Path) -> Registration:
     InputError
         If it is no registration, contradicts itself, or was written by a newer meshreg.
     """
-    from meshreg.io.safe import open_regular
-
     path = Path(path)
     if path.is_dir():
         path = path / "registration.json"

@@ -18,6 +18,7 @@ import numpy as np
 from meshreg.errors import InputError, OutputError, UsageError
 from meshreg.io import e57_pages, e57_xml
 from meshreg.io.assemble import Found, placed_survey
+from meshreg.io.atomic import atomic_file
 from meshreg.io.classes import RECLASS, ground_classes
 from meshreg.io.crs import crs_text
 from meshreg.io.directions import bend_note, find_directions
@@ -39,7 +40,7 @@ from meshreg.io.e57_xml import Layout
 from meshreg.io.frames import Mover, place
 from meshreg.io.options import ReadOptions
 from meshreg.io.rewriting import require_unchanged, warn
-from meshreg.io.safe import atomic_file, open_regular
+from meshreg.io.safe import open_regular
 from meshreg.records import Float64, PointCloud, SourceFile, Survey, UInt8
 
 log = logging.getLogger("meshreg")

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from meshreg.errors import InputError, UsageError
-from meshreg.io import READERS
+from meshreg.io.formats import READERS
 from meshreg.io.safe import open_regular, require_inside
 from meshreg.io.sidecar import is_sidecar
 

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from meshreg.errors import InputError, MeshregError, UsageError
+from meshreg.io.axes import ENU, Y_UP
 from meshreg.io.bridge import bridge
 from meshreg.io.crs import (
     crs_name,
@@ -27,7 +28,7 @@ from meshreg.io.crs import (
     parse_crs,
     vertical_part,
 )
-from meshreg.io.framing import ENU, NED, UNITS, Y_UP, frame_from
+from meshreg.io.framing import frame_from
 from meshreg.io.mover import Mover, frame_matrix, make_mover, to_absolute, to_file
 from meshreg.io.options import ReadOptions
 from meshreg.io.precision import single_precision_note
@@ -308,10 +309,6 @@ def _geocentric(frame: Frame) -> bool:
 
 
 __all__ = [
-    "ENU",
-    "NED",
-    "UNITS",
-    "Y_UP",
     "Mover",
     "Placed",
     "common_crs",

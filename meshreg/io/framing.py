@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from meshreg.errors import InputError, UsageError
+from meshreg.io.axes import ENU, NED, UNITS, Y_UP
 from meshreg.io.crs import (
     check_area,
     crs_name,
@@ -19,20 +20,6 @@ from meshreg.io.options import UNIT_RANGE, ReadOptions
 from meshreg.io.sidecar import SidecarInfo
 from meshreg.records import Float64, Frame
 from meshreg.settings.checked import shown
-
-ENU = np.eye(3)
-NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
-Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-UNITS = {
-    "m": 1.0,
-    "dm": 0.1,
-    "cm": 0.01,
-    "mm": 0.001,
-    "km": 1000.0,
-    "ft": 0.3048,
-    "us-ft": 1200 / 3937,
-    "in": 0.0254,
-}
 
 
 def frame_from(

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from meshreg.errors import InputError, UsageError
+from meshreg.io.axes import UNITS
 from meshreg.io.geotiff import (
     EXPORT,
     crs_of,
@@ -289,8 +290,6 @@ def _drop_undeclared_color(colors: UInt8, valid: Bool, notes: list[str]) -> None
 
 def height_unit(raw: RawMap, option: str | None) -> float | None:
     """Return metres per unit of a DEM's heights as the user or the band says; None if neither."""
-    from meshreg.io.frames import UNITS
-
     if option is not None:
         if option.strip().lower() not in UNITS:
             raise UsageError(f"unit {option!r} is not known.", remedy=f"Use {', '.join(UNITS)}.")

@@ -11,9 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from meshreg.errors import InputError, OutputError
+from meshreg.io.atomic import atomic_file
 from meshreg.io.crs import parse_crs
 from meshreg.io.geotiff import environment, opened, windows
-from meshreg.io.safe import atomic_file, open_regular
+from meshreg.io.safe import open_regular
 from meshreg.records import Bool, Float32, Grid, UInt8
 
 log = logging.getLogger("meshreg")

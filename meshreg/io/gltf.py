@@ -21,7 +21,7 @@ from meshreg.io.assemble import (
     assemble_survey,
     without_broken_uv,
 )
-from meshreg.io.frames import ENU, Y_UP
+from meshreg.io.axes import ENU, Y_UP
 from meshreg.io.gltf_center import relative_to_center, unread_places
 from meshreg.io.gltf_document import Document, read_document
 from meshreg.io.gltf_parts import Notes, Part, read_parts

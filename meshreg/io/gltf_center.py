@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from meshreg.io.assemble import RawGeometry
-from meshreg.io.frames import Y_UP
+from meshreg.io.axes import Y_UP
 from meshreg.io.gltf_document import Document, extension
 from meshreg.io.options import FARTHEST, ReadOptions
 from meshreg.io.sidecar import SidecarInfo, find_sidecar

@@ -13,6 +13,7 @@ from urllib.parse import quote
 import numpy as np
 
 from meshreg.errors import InputError
+from meshreg.io.atomic import atomic_file
 from meshreg.io.gltf_center import center_of, with_center
 from meshreg.io.gltf_document import Document, read_document
 from meshreg.io.gltf_nodes import roots_of, scene_roots
@@ -25,7 +26,7 @@ from meshreg.io.rewriting import (
     require_close,
     require_unchanged,
 )
-from meshreg.io.safe import atomic_file, file_bytes
+from meshreg.io.safe import file_bytes
 from meshreg.io.second_reader import require_glb
 from meshreg.records import Float64, SourceFile
 

@@ -12,12 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from meshreg.errors import OutputError, UsageError
-from meshreg.io.frames import Y_UP
+from meshreg.io.atomic import atomic_file
+from meshreg.io.axes import Y_UP
 from meshreg.io.gltf_document import read_document
 from meshreg.io.gltf_parts import read_geometry
 from meshreg.io.images import EncodedImage
 from meshreg.io.rewriting import require_close
-from meshreg.io.safe import atomic_file, file_bytes
+from meshreg.io.safe import file_bytes
 from meshreg.io.sidecar import write_shift
 from meshreg.records import Frame, Mesh, PointCloud, Survey, Texture
 

@@ -19,10 +19,9 @@ from typing import Any
 import numpy as np
 
 from meshreg.errors import InputError, ResourceLimitError, UsageError
+from meshreg.io.atomic import atomic_file, copy_file
 from meshreg.io.decoding import Decoder
 from meshreg.io.safe import (
-    atomic_file,
-    copy_file,
     fingerprint,
     free_memory,
     open_regular,

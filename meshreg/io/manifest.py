@@ -19,6 +19,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from meshreg.errors import InputError, UsageError
+from meshreg.io.atomic import as_output_error, atomic_file
+from meshreg.io.safe import open_regular
 
 if TYPE_CHECKING:
     from meshreg.records import Survey
@@ -77,8 +79,6 @@ def write_into(folder: Path, files: Mapping[str, bytes]) -> None:
     OutputError
         One cannot be written; those before it are new.
     """
-    from meshreg.io.atomic import as_output_error, atomic_file
-
     document = _document(folder) if (folder / NAME).is_file() else None
     coming = {
         name: {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
@@ -362,8 +362,6 @@ def _document(folder: Path) -> dict[str, Any]:
     UsageError
         It is none: then nothing says what in that folder is ours.
     """
-    from meshreg.io.safe import open_regular
-
     path = folder / NAME
     why = "is damaged"
     try:
@@ -393,8 +391,6 @@ def _is_manifest(document: Any) -> bool:
 
 
 def _save(folder: Path, document: dict[str, Any]) -> None:
-    from meshreg.io.atomic import atomic_file
-
     text = json.dumps(document, indent=1, sort_keys=True)
     with atomic_file(folder / NAME) as partial:
         partial.write_text(text + "\n", encoding="utf-8")

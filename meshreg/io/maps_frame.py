@@ -8,7 +8,7 @@ import numpy as np
 
 from meshreg.errors import MeshregError, UsageError
 from meshreg.io.crs import crs_name, metres_up, parse_crs
-from meshreg.io.frames import frame_from
+from meshreg.io.framing import frame_from
 from meshreg.io.geotiff_values import RawMap, height_unit
 from meshreg.io.mover import to_absolute
 from meshreg.io.options import ReadOptions

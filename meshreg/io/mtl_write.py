@@ -9,12 +9,11 @@ from contextlib import suppress
 from pathlib import Path, PurePosixPath
 
 from meshreg.errors import InputError, OutputError
+from meshreg.io.atomic import atomic_file, copy_file
 from meshreg.io.mtl import name_start
 from meshreg.io.rewriting import copy_name
 from meshreg.io.safe import (
     MissingReferenceError,
-    atomic_file,
-    copy_file,
     decode_name,
     open_regular,
     resolve_reference,

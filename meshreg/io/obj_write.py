@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from meshreg.errors import OutputError, UsageError
+from meshreg.io.atomic import atomic_file
 from meshreg.io.directions import bend_note, find_directions
 from meshreg.io.images import texture_suffix, write_texture
 from meshreg.io.line_blocks import Block, in_order, line_blocks
@@ -27,7 +28,7 @@ from meshreg.io.rewriting import (
     require_unchanged,
     warn,
 )
-from meshreg.io.safe import atomic_file, open_regular
+from meshreg.io.safe import open_regular
 from meshreg.io.second_reader import ANYTHING, Expected, LineRule, require_lines
 from meshreg.io.sidecar import write_shift
 from meshreg.records import Float64, Frame, Mesh, PointCloud, SourceFile, Survey, UInt8

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from meshreg.errors import InputError, OutputError, UsageError
 from meshreg.io.assemble import Found, RawGeometry, assemble_survey, eight_bit_colors
+from meshreg.io.atomic import atomic_file
 from meshreg.io.mover import Mover
 from meshreg.io.options import ReadOptions
 from meshreg.io.ply_text import line_of, read_numbers
@@ -22,7 +23,7 @@ from meshreg.io.rewriting import (
     require_close,
     require_unchanged,
 )
-from meshreg.io.safe import atomic_file, file_bytes, open_regular, require
+from meshreg.io.safe import file_bytes, open_regular, require
 from meshreg.io.second_reader import SLACK
 from meshreg.io.sidecar import write_shift
 from meshreg.records import Float64, Frame, Mesh, SourceFile, Survey

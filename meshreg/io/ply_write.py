@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from meshreg.errors import InputError, OutputError, UsageError
+from meshreg.io.atomic import atomic_file
 from meshreg.io.directions import Directions, bend_note, find_directions, stored, turn_columns
 from meshreg.io.images import texture_suffix, write_texture
 from meshreg.io.mover import Mover
@@ -29,7 +30,7 @@ from meshreg.io.rewriting import (
     require_unchanged,
     warn,
 )
-from meshreg.io.safe import atomic_file, file_bytes, resolve_reference
+from meshreg.io.safe import file_bytes, resolve_reference
 from meshreg.io.second_reader import SLACK, require_ply
 from meshreg.io.sidecar import write_shift
 from meshreg.records import Frame, Mesh, PointCloud, SourceFile, Survey

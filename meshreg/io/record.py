@@ -64,7 +64,7 @@ def write_registration(
     OutputError
         If a file could not be written or did not read back as it should.
     """
-    from meshreg.io.atomic import atomic_folder
+    from meshreg.io.folders import atomic_folder
     from meshreg.io.manifest import NAME, require_apart, survey_files
 
     folder = Path(folder)
@@ -99,11 +99,11 @@ def write_record_files(
         if reference is not None and moving is not None:
             written += _write_file_transforms(transform, folder, reference, moving)
         if moving is not None and moving.source:
-            from meshreg.io import rewrite_survey
+            from meshreg.io.blocks import rewrite
 
             warp = registration.warp
             moved = moved or partial(
-                rewrite_survey, moving, transform, folder, reference, warp=warp
+                rewrite, moving, transform, folder, reference, "_registered", warp
             )
             written += moved()
     text = to_json(registration_document(registration))

@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from meshreg.errors import InputError, OutputError, UsageError
+from meshreg.io.atomic import copy_file
 from meshreg.io.mover import Mover
-from meshreg.io.safe import copy_file, fingerprint
+from meshreg.io.safe import fingerprint
 from meshreg.records import Float64, SourceFile, ends
 
 _LOG = logging.getLogger("meshreg")

@@ -2,7 +2,7 @@
 
 Every reader passes the names found inside a survey file through `resolve_reference`, those that it
 looks for by itself through `beside` (a side file) or `require_inside` (what a folder holds), every
-declared count through `require`; every writer goes through `atomic_file` or `atomic_folder`.
+declared count through `require`; every writer goes through `atomic` or `folders`.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ import functools
 import hashlib
 import os
 import re
-import shutil
 import stat
 import struct
 import unicodedata
@@ -25,11 +24,9 @@ import numpy as np
 from meshreg.errors import (
     InputError,
     MeshregError,
-    OutputError,
     ResourceLimitError,
     UnsafeReferenceError,
 )
-from meshreg.io.atomic import as_output_error, atomic_file, atomic_folder
 from meshreg.records import UInt8
 
 _SCHEME_OR_DRIVE = re.compile(r"[A-Za-z][A-Za-z0-9+.\-]*:")
@@ -411,37 +408,10 @@ def fingerprint(path: Path, companions: Sequence[Path] = ()) -> tuple[int, int]:
     return size, time
 
 
-def copy_file(source: Path, target: Path) -> None:
-    """Copy a regular file's bytes to a new file; refuse to replace one of other content.
-
-    Raises
-    ------
-    OutputError
-        `target` exists and differs, or any OSError.
-    """
-    if os.path.lexists(target):
-        if target.is_file() and sha256(target) == sha256(source):
-            return
-        raise OutputError(
-            "exists already with other content.", file=target, remedy="Choose another folder."
-        )
-    with as_output_error(target):
-        target.parent.mkdir(parents=True, exist_ok=True)
-    with (
-        open_regular(source) as stream,
-        atomic_file(target) as temporary,
-        open(temporary, "wb") as out,
-    ):
-        shutil.copyfileobj(stream, out, 1 << 20)
-
-
 __all__: list[str] = [
     "FARTHEST",
     "MissingReferenceError",
-    "atomic_file",
-    "atomic_folder",
     "beside",
-    "copy_file",
     "data_errors",
     "decode_name",
     "file_bytes",

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from meshreg.errors import InputError
+from meshreg.io.axes import UNITS
 from meshreg.io.options import FARTHEST, UNIT_RANGE
 from meshreg.io.safe import beside, decode_name, open_regular
 from meshreg.settings.checked import parse_toml, shown
@@ -363,7 +364,6 @@ def read_toml(path: Path) -> SidecarInfo:
 
 def _check_key(path: Path, key: str, value: Any) -> None:
     """Refuse a key or a value that cannot be meant, rather than read the survey elsewhere."""
-    from meshreg.io.framing import UNITS
 
     def within(item: Any, low: float, high: float) -> bool:
         return type(item) in (int, float) and low <= item <= high  # false for NaN

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from meshreg.errors import OutputError
-from meshreg.io.safe import atomic_file
+from meshreg.io.atomic import atomic_file
+from meshreg.io.axes import ENU, NED, UNITS, Y_UP
 from meshreg.records import Frame
 
 
@@ -101,7 +102,6 @@ def _remove(path: Path) -> None:
 def _frame_words(frame: Frame) -> dict[str, Any]:
     """Return `axes`, `up` and `unit` of a frame as a .survey.toml says them; empty if plain."""
     from meshreg.io.crs import metres_per_unit
-    from meshreg.io.framing import ENU, NED, UNITS, Y_UP
 
     length = float(np.cbrt(abs(np.linalg.det(frame.axes))))
     words: dict[str, Any] = {}

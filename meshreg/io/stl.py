@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from meshreg.errors import InputError, UsageError
 from meshreg.io.assemble import Found, RawGeometry, assemble_survey
+from meshreg.io.atomic import atomic_file
 from meshreg.io.directions import bend_note, find_directions
 from meshreg.io.mover import Mover
 from meshreg.io.options import ReadOptions
@@ -29,7 +30,7 @@ from meshreg.io.rewriting import (
     require_unchanged,
     warn,
 )
-from meshreg.io.safe import atomic_file, file_bytes, open_regular
+from meshreg.io.safe import file_bytes, open_regular
 from meshreg.io.second_reader import ANYTHING, SLACK, Expected, require_lines, require_rows
 from meshreg.io.sidecar import write_shift
 from meshreg.records import Float64, Frame, Mesh, SourceFile, Survey, UInt8

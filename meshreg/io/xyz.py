@@ -10,9 +10,10 @@ import numpy as np
 
 from meshreg.errors import InputError
 from meshreg.io.assemble import Found, eight_bit_colors, placed_survey
+from meshreg.io.axes import ENU
 from meshreg.io.classes import RECLASS, ground_classes
 from meshreg.io.cloud import without_strays
-from meshreg.io.frames import ENU, place
+from meshreg.io.frames import place
 from meshreg.io.options import ReadOptions
 from meshreg.io.safe import file_bytes
 from meshreg.io.sidecar import SidecarInfo, find_sidecar

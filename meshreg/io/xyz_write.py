@@ -12,10 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from meshreg.errors import OutputError, UsageError
+from meshreg.io.atomic import atomic_file
 from meshreg.io.directions import bend_note, turn_columns
 from meshreg.io.mover import Mover
 from meshreg.io.rewriting import Extent, moved_points, require_unchanged, warn
-from meshreg.io.safe import atomic_file, file_bytes
+from meshreg.io.safe import file_bytes
 from meshreg.io.second_reader import ANYTHING, Expected, LineRule, require_lines
 from meshreg.io.sidecar import find_sidecar, write_shift
 from meshreg.io.xyz_layout import Layout, read_layout

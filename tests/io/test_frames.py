@@ -16,12 +16,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from meshreg.errors import InputError, UsageError
+from meshreg.io.axes import NED, UNITS, Y_UP
 from meshreg.io.bridge import bridge
 from meshreg.io.crs import crs_text, mend_proj_data, metric_crs
 from meshreg.io.frames import (
-    NED,
-    UNITS,
-    Y_UP,
     common_crs,
     frame_from,
     grid_scale_and_convergence,

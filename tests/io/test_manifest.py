@@ -17,8 +17,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from meshreg.errors import UsageError
-from meshreg.io import atomic, manifest
-from meshreg.io.atomic import atomic_folder
+from meshreg.io import atomic, folders, manifest
+from meshreg.io.folders import atomic_folder
 from meshreg.io.manifest import (
     require_apart,
     require_only_ours,
@@ -148,13 +148,13 @@ def test_what_appears_during_the_run_is_kept(
         assert (out / "registration.json").read_text() == "1"
         assert (out / "late.txt").read_text() == "mine"
         return
-    swap = atomic._swap_in
+    swap = folders._swap_in
 
     def swap_late(temporary: Path, path: Path, old: Path) -> Path:
         late(path)
         return swap(temporary, path, old)
 
-    monkeypatch.setattr(atomic, "_swap_in", swap_late)
+    monkeypatch.setattr(folders, "_swap_in", swap_late)
     make(out, overwrite=True, text="2")
     assert (out / "registration.json").read_text() == "2"
     assert tree(out.parent / "OUT.kept") == {"late.txt": b"mine"}
@@ -185,7 +185,7 @@ def test_the_old_result_is_there_until_the_new_one_is_whole(
 ) -> None:
     """At no system call is OUT missing: it is looked for before each one that renames."""
     seen = []
-    real = atomic._exchange
+    real = folders._exchange
 
     def watched(one: Path, other: Path) -> bool:
         seen.append((other / "registration.json").read_text())
@@ -193,8 +193,8 @@ def test_the_old_result_is_there_until_the_new_one_is_whole(
         seen.append((other / "registration.json").read_text())
         return done
 
-    monkeypatch.setattr(atomic, "_exchange", watched)
-    monkeypatch.setattr(atomic.os, "replace", lambda *_: pytest.fail("OUT would be missing"))
+    monkeypatch.setattr(folders, "_exchange", watched)
+    monkeypatch.setattr(folders.os, "replace", lambda *_: pytest.fail("OUT would be missing"))
     with atomic_folder(out, overwrite=True) as folder:
         (folder / "registration.json").write_text("2")
     assert seen == ["1", "2"]
@@ -355,7 +355,7 @@ def test_a_run_killed_at_any_file_leaves_only_files_that_are_ours(
                 os.rename(source, to)
 
             with monkeypatch.context() as patch:
-                patch.setattr("meshreg.io.atomic.os.replace", replace)
+                patch.setattr("meshreg.io.folders.os.replace", replace)
                 with pytest.raises(KeyboardInterrupt):
                     write_into(out, {name: data + bytes([at]) for name, data in files.items()})
             assert len(replaced) == at
@@ -431,7 +431,7 @@ class StopAt:
     def __call__(self, frame: FrameType, event: str, arg: object) -> StopAt | None:
         code = frame.f_code
         if (
-            code.co_filename not in (atomic.__file__, manifest.__file__)
+            code.co_filename not in (atomic.__file__, folders.__file__, manifest.__file__)
             or code.co_name == "_locked"
         ):
             return None  # the lock ends with the process, which the test does not
@@ -449,9 +449,9 @@ def test_a_signal_at_any_line_leaves_one_whole_result_and_every_file_that_is_not
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, exchange: bool
 ) -> None:
     """Somebody puts a file into OUT at the last moment, after it was looked at for such."""
-    swap, before = atomic._swap_in, sys.gettrace()
+    swap, before = folders._swap_in, sys.gettrace()
     if not exchange:
-        monkeypatch.setattr(atomic, "_exchange", lambda one, other: False)
+        monkeypatch.setattr(folders, "_exchange", lambda one, other: False)
 
     def late(temporary: Path, path: Path, old: Path) -> None:
         (path / "mine.txt").write_text("mine")
@@ -464,7 +464,7 @@ def test_a_signal_at_any_line_leaves_one_whole_result_and_every_file_that_is_not
         out.parent.mkdir()
         make(out)
         with monkeypatch.context() as patch:
-            patch.setattr(atomic, "_swap_in", late)
+            patch.setattr(folders, "_swap_in", late)
             try:
                 with atomic_folder(out, overwrite=True, command="register") as folder:
                     (folder / "registration.json").write_text("2")

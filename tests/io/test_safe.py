@@ -19,11 +19,10 @@ from hypothesis import strategies as st
 
 from meshreg.errors import InputError, OutputError, UnsafeReferenceError, UsageError
 from meshreg.io import atomic
+from meshreg.io.atomic import atomic_file, copy_file
+from meshreg.io.folders import atomic_folder
 from meshreg.io.safe import (
     MissingReferenceError,
-    atomic_file,
-    atomic_folder,
-    copy_file,
     decode_name,
     file_bytes,
     fingerprint,

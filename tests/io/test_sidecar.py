@@ -9,7 +9,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from meshreg.errors import InputError, OutputError
-from meshreg.io.frames import NED, Y_UP, frame_from
+from meshreg.io.axes import NED, Y_UP
+from meshreg.io.frames import frame_from
 from meshreg.io.options import ReadOptions
 from meshreg.io.sidecar import SidecarInfo, find_sidecar, is_sidecar, write_shift
 from meshreg.records import Frame

@@ -13,7 +13,8 @@ from data_synth.change import Change, apply_change
 from data_synth.recipe import load
 from data_synth.regions import describe_change
 from data_synth.scene import Scene, make_scene
-from data_synth.seafloor import SITES, make_seafloor
+from data_synth.seafloor import make_seafloor
+from data_synth.sites import SITES
 from meshreg.errors import UsageError
 
 BOUNDS = (-4.0, -4.0, 4.0, 4.0)

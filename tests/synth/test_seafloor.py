@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from data_synth import types as t
-from data_synth.seafloor import SITES, Seafloor, ground_of, make_seafloor
+from data_synth.seafloor import Seafloor, ground_of, make_seafloor
+from data_synth.sites import SITES
 
 BOUNDS = (-3.0, -3.0, 3.0, 3.0)
 
