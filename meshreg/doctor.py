@@ -35,7 +35,7 @@ assert tree.nearest_neighbor_search([0.9, 0.0, 0.0])[1] == 1
 print("small_gicp", m.version("small_gicp"))
 """
 _OPEN3D = """
-from meshreg.open3d_loading import load_open3d
+from meshreg.refine.open3d_loading import load_open3d
 open3d = load_open3d()
 cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector([[0.0, 0, 0], [1.0, 0, 0]]))
 assert open3d.geometry.KDTreeFlann(cloud).search_knn_vector_3d([0.9, 0, 0], 1)[1][0] == 1

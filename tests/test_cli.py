@@ -660,7 +660,7 @@ def register_pair(*surveys, **rest):
         while True:
             time.sleep(0.01)
 meshreg.pipeline.register_pair = register_pair
-from meshreg.cli import run
+from meshreg.cli.app import run
 sys.exit(run(sys.argv[1:]))
 """
 

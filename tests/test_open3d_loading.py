@@ -22,7 +22,7 @@ LINUX = pytest.mark.skipif(sys.platform != "linux", reason="elsewhere Open3D bri
 def test_libusb_is_the_packages_also_where_the_system_has_one():
     """So the developers' machines and CI run what a machine without libusb runs."""
     code = (
-        "from meshreg.open3d_loading import load_open3d\n"
+        "from meshreg.refine.open3d_loading import load_open3d\n"
         "print(load_open3d().__version__)\n"
         "maps = [line.split()[-1] for line in open('/proc/self/maps') if 'libusb' in line]\n"
         "print(*sorted(set(maps)), sep='\\n')\n"

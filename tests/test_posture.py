@@ -13,7 +13,7 @@ from test_pipeline import survey as ground
 
 from meshreg import Mesh, PointCloud, Survey, register_pair
 from meshreg.io.axes import ENU, NED, Y_UP
-from meshreg.pipeline.posture import AXES, in_degrees, level_axes, other_axes, posture
+from meshreg.pipeline.postures import AXES, in_degrees, level_axes, other_axes, posture
 from meshreg.records import Frame, Grid, Maps, SourceFile
 
 HOME = np.array([731_000.0, 5_705_000.0, -12.0])

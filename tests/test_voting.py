@@ -14,7 +14,7 @@ from data_synth.rasters import make_rasters
 from data_synth.recipe import load
 from meshreg import Mesh, Settings, Survey, apply_transform, register_pair
 from meshreg.benchmark.measure import register_rasters
-from meshreg.heading import turning as heading
+from meshreg.heading import turned as heading
 from meshreg.heading import voting
 from meshreg.heading.tile_surfaces import channel_surfaces, surfaces_bytes
 from meshreg.heading.voting import STANDS_OUT, not_voted, similarity, vote

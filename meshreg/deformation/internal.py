@@ -1,7 +1,7 @@
 """The internal error: how the two models bend against each other once a rigid move has laid them.
 
-Measured for every pair, from the offsets of tiles (`meshreg.tiles`) and the heights of tiles, and
-named in words. The bend that predicts held-out tiles best (`meshreg.ladder`) can be applied as a
+Measured for every pair, from the offsets of tiles (`refine.tiles`) and the heights of tiles, and
+named in words. The bend that predicts held-out tiles best (`ladder`) can be applied as a
 `Warp`: after the transform, at the place where the transform has put a point.
 """
 

@@ -1,6 +1,6 @@
 """Which smooth bend the tiles speak for: rigid, similarity, dome, quadratic or spline.
 
-Each model is fitted to offsets that were measured tile by tile (`meshreg.warp`), robustly and with
+Each model is fitted to offsets that were measured tile by tile (`deformation`), robustly and with
 each tile predicted from the others. A richer model is taken only where it predicts tiles that it
 has not seen clearly better, on all of the ground and on that which needed no bend, folds nothing,
 and strains the survey as a whole (`strain`) by less than a survey can be strained.

@@ -12,7 +12,7 @@ from meshreg.heading.tile_surfaces import (
     near_offset,
     part_of,
 )
-from meshreg.heading.turning import (
+from meshreg.heading.turned import (
     Pairs,
     Turned,
     turned_as_voted,

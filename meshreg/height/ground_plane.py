@@ -1,6 +1,6 @@
 """The plane through the height differences of the ground that counts, and how sure it is.
 
-Each block's ground is where most of its cells agree (`meshreg.ground`). Blocks that changed as a
+Each block's ground is where most of its cells agree (`height.ground`). Blocks that changed as a
 whole are told by their neighbours, and the plane is the least-squares fit of all with a weight of
 one for each cell.
 """

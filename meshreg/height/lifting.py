@@ -191,13 +191,13 @@ def fitted_plane(pair: DemPair, horizontal: Transform) -> Heights:
 
     The difference ``dz = reference - moving`` at a moved cell is modelled as
     ``up + tilt_east * (n - n0) - tilt_north * (e - e0)``. Cells count where the detail of their
-    surroundings recurs (`meshreg.ground.recurring`). Each block's ground is the trimmed mean of
+    surroundings recurs (`height.ground.recurring`). Each block's ground is the trimmed mean of
     those around the centre of its shortest half (least trimmed squares: Rousseeuw and Leroy 1987,
     chapter 4), blocks that a step or four deviations part from their neighbours are told by them,
     and the plane is the least-squares fit with a weight of one for each cell. Since the moved cells
     are looked up anew after each step, relief does not bias a large tilt.
 
-    The covariance is the block sandwich (`meshreg.sandwich`) of the blocks' departures from their
+    The covariance is the block sandwich of the blocks' departures from their
     neighbours for `up`, from a slow bending (a cubic in east and north) for the tilt, over parcels
     at least two correlation lengths of these departures wide: the slow bending itself moves the
     best fit over all ground as much as this one. Added to the variance of `up` is the square of how

@@ -62,30 +62,38 @@ def atomic_file(path: Path) -> Iterator[Path]:
     path = Path(path)
     with as_output_error(path):
         _clear_partial(path)
-        temporary, handle = _new_partial(path)
+        made: list[Path] = []
+        handle = -1
         try:
+            handle = _new_partial(path, made)
+            temporary = made[-1]
             yield temporary
             _sync(temporary)
             os.replace(temporary, path)
             _sync_folder(path.parent)
         finally:
-            temporary.unlink(missing_ok=True)
+            for temporary in made:
+                temporary.unlink(missing_ok=True)
             with contextlib.suppress(OSError):  # nothing was written through it
                 os.close(handle)
 
 
-def _new_partial(path: Path) -> tuple[Path, int]:
-    """Make an empty temporary file beside `path`; the lock says that its process lives."""
+def _new_partial(path: Path, made: list[Path]) -> int:
+    """Make an empty temporary file beside `path`; the lock says that its process lives.
+
+    Its name is the last in `made`, and is there before the file: a signal may come between.
+    """
     import fcntl  # POSIX only
 
     before, after = _partial_name(path)
     while True:
         temporary = path.with_name(before + secrets.token_hex(6) + after)
+        made.append(temporary)
         handle = os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_RDWR | os.O_CLOEXEC, 0o666)
         with contextlib.suppress(BlockingIOError):
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
             if temporary.exists():  # else another process took it for a dead one's, just now
-                return temporary, handle
+                return handle
         os.close(handle)
 
 

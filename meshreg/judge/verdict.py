@@ -62,7 +62,7 @@ class Found:
     turned : str
         Why the tiles give no answer of their own (`meshreg.refine`).
     tilted : str
-        Why the heights give none (`meshreg.heights`).
+        Why the heights give none (`height`).
     scaled : str
         Which scale was applied though nobody asked for it (`meshreg.heading`).
     stretch : Stretch or None
@@ -85,7 +85,7 @@ class Found:
     undecided : float
         What tones and edges of the image disagree by, in cells, where it alone tells the place.
     surfaces : str
-        Where both surfaces ask to lie instead (`meshreg.surfaces`).
+        Where both surfaces ask to lie instead (`refine.surfaces`).
     ties : str
         In what hand-picked points contradict the answer.
     """

@@ -5,12 +5,12 @@ two reasons: noise, and the surveys' internal warp. Since blocks of ground lie d
 another, the highest peak of a score is near the offset that most blocks share (its mode), not near
 their mean, and no curvature of that peak tells the difference. So every block is asked for its own
 offset, in a small window round the method's answer; the best motion over all of the ground follows
-from them by kriging (`meshreg.kriging`), and the stated covariance is the mean square error
+from them by kriging (`statistics.kriging`), and the stated covariance is the mean square error
 
     sigma = (t - T)(t - T)' + cov(T)
 
 of the method's offset t, with T the blocks' best motion. Where too few blocks answer, it is the
-block sandwich of t itself (`meshreg.sandwich`), from the slope and the curvature of the blocks'
+block sandwich of t itself (`statistics.sandwich`), from the slope and the curvature of the blocks'
 scores at t, widened for few blocks as Hotelling's T² is.
 """
 

@@ -10,7 +10,7 @@ from meshreg.pipeline.decision import (
     covariance_of,
     decide,
 )
-from meshreg.pipeline.posture import (
+from meshreg.pipeline.postures import (
     in_degrees,
     level_axes,
     posture,

@@ -27,7 +27,7 @@ from meshreg.pipeline.compare import APART, compare
 from meshreg.pipeline.decision import Clock, Decision, Manual, Progress, completed, decide
 from meshreg.pipeline.far_pose import far_pose
 from meshreg.pipeline.levels import lay_down, pair_grids, rasterize_pair
-from meshreg.pipeline.posture import axes_after, in_degrees, other_axes, posture
+from meshreg.pipeline.postures import axes_after, in_degrees, other_axes, posture
 from meshreg.pipeline.search_cost import require_search
 from meshreg.raster.grid import choose_cells
 from meshreg.records import (

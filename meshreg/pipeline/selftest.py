@@ -19,7 +19,7 @@ from meshreg.errors import UsageError
 from meshreg.heading import Pairs, Turn, turning
 from meshreg.pipeline.decision import Decision, completed, decide
 from meshreg.pipeline.levels import rasterize_pair
-from meshreg.pipeline.posture import in_degrees
+from meshreg.pipeline.postures import in_degrees
 from meshreg.pipeline.register import prepared, require_different, surveys_apart
 from meshreg.records import Float64, Survey, Transform, Verdict
 from meshreg.settings import Settings

@@ -48,16 +48,16 @@ class Registration:
         centroid of the overlap in the reference (`meshreg.statistics.registration_error`).
     internal : mapping or None
         The internal error: `said` in words, whether a warp was `applied`, and numbers of the
-        `horizontal` and `vertical` model (`meshreg.warp`); None where it was not measured.
+        `horizontal` and `vertical` model (`deformation`); None where it was not measured.
     false_alarm : float or None
         Chance that unrelated ground would make the best hypothesis stand out as much, measured on
         the pair itself (`meshreg.judge`).
     findings : tuple of Finding
-        What later stages found against accepting the pair (`meshreg.verdict`), in the order of the
+        What later stages found against accepting the pair (`judge.verdict`), in the order of the
         reason; empty where nothing was.
     heights_gain : mapping or None
         How many times as high the moving survey's relief is as the reference's: `value`, and
-        `sigma` of its natural logarithm (`meshreg.gain`), both None with the `reason` where that
+        `sigma` of its natural logarithm (`height.gain`), both None with the `reason` where that
         could not be told; None where it was not looked for.
     warp : Warp or None
         The bend that was applied after the transform, where one was asked for and found.

@@ -2,7 +2,7 @@
 
 Each tile of the moving survey is correlated alone, to a hundredth of a cell; the offsets of all are
 then one random field, and the motion that fits best over the whole overlap is its best linear
-unbiased estimate (`meshreg.statistics.kriging`).
+unbiased estimate (`statistics.kriging`).
 """
 
 from meshreg.refine.rigid import (

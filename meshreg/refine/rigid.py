@@ -382,7 +382,7 @@ def fit(tiles: TileOffsets, pivot: Float64) -> Refined:
     """Robust rigid fit of tile offsets: ``d = t + yaw * (-(n - n0), e - e0)``.
 
     Tukey's biweight at 4 robust deviations, one deviation per channel. The covariance is the
-    block sandwich (`meshreg.sandwich`), since channels at one place err alike.
+    block sandwich (`statistics.sandwich`), since channels at one place err alike.
     """
     columns = design(tiles.places, pivot, 3)
     middle = np.median(tiles.offsets, axis=0)

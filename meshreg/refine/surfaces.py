@@ -231,7 +231,7 @@ def _agreement(fixed: Float64, normals: Float64, loose: Float64) -> tuple[float,
     """Rms distance [m] from the tangent planes, share within the gate, covariance (6, 6).
 
     With ``r = n . (p - q)`` and ``J = (n, p × n)``, weights by Tukey's biweight over the gate: the
-    sandwich (`meshreg.sandwich`) over square blocks of ground, as of the heights. Zero where fewer
+    sandwich over square blocks of ground, as of the heights. Zero where fewer
     than two blocks a parameter are left.
     """
     from scipy.spatial import cKDTree

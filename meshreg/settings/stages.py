@@ -1,7 +1,7 @@
 """Every number that a user may change: one frozen dataclass a stage, in metres.
 
 `robust` is the default preset; `paper` is Bryson et al. (IROS 2013) as published. Each setting has
-its range beside it (`meshreg.checked`); after a change run `scripts/settings_table.py`.
+its range beside it (`meshreg.settings.checked`); after a change run `scripts/settings_table.py`.
 """
 
 from __future__ import annotations
@@ -201,7 +201,7 @@ class RefineSettings(Checked):
 
 @dataclass(frozen=True)
 class WarpSettings(Checked):
-    """The non-rigid answer (`meshreg.warp`); the internal error is measured whatever this says."""
+    """The non-rigid answer (`deformation`); the internal error is measured whatever this says."""
 
     section: ClassVar[str] = "warp"
     model: str = choice("none", "the bend that is applied", WARPS)

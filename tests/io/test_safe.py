@@ -331,6 +331,23 @@ def failing_after(monkeypatch, good):
     return failed
 
 
+def test_a_signal_right_after_the_file_is_made_leaves_nothing(tmp_path, monkeypatch):
+    """It may come before any name is bound to what was opened."""
+    real = os.open
+
+    def interrupted(path, flags, *mode):
+        handle = real(path, flags, *mode)
+        if flags & os.O_EXCL:
+            os.close(handle)
+            raise KeyboardInterrupt
+        return handle
+
+    monkeypatch.setattr(atomic.os, "open", interrupted)
+    with pytest.raises(KeyboardInterrupt), atomic_file(tmp_path / "out.txt"):
+        pytest.fail("the block is not reached")
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_atomic_file_survives_a_fault_at_every_call(tmp_path):
     path = tmp_path / "out.txt"
     for good in range(100):
