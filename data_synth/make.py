@@ -19,8 +19,8 @@ from data_synth.scene import Scene, Take, View, make_scene
 from data_synth.seeing import Lattice
 from data_synth.truth import make_truth
 from meshreg.errors import UsageError
-from meshreg.io.atomic import as_output_error
-from meshreg.io.folders import atomic_folder
+from meshreg.io.files.atomic import as_output_error
+from meshreg.io.result.folders import atomic_folder
 from meshreg.records import Survey
 
 Progress = Callable[[str, float], None]

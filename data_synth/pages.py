@@ -25,6 +25,6 @@ def encode_jpeg(pixels: NDArray[np.uint8], quality: int = QUALITY) -> bytes:
 
 def encode_page(pixels: NDArray[np.uint8], name: str) -> Texture:
     """Return a texture page that holds its JPEG."""
-    from meshreg.io.images import open_texture_bytes
+    from meshreg.io.files.images import open_texture_bytes
 
     return open_texture_bytes(encode_jpeg(pixels), f"{name}.jpg", pixels.shape[0] * pixels.shape[1])

@@ -1,4 +1,4 @@
-"""The slow readable twin of `meshreg.io.regrid_kernels`: NumPy, a whole raster at once."""
+"""The slow readable twin of `meshreg.io.maps.regrid_kernels`: NumPy, a whole raster at once."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def sample(values, valid, matrix, x, y):
 
 
 def resample(values, valid, placed, source, surface, surface_placed, is_height):
-    """Return what the kernel puts into `out` and `seen`, from a `meshreg.io.regrid.Source`."""
+    """Return what the kernel puts into `out` and `seen`, from a `meshreg.io.maps.regrid.Source`."""
     shape = source.grid.shape
     row, col = (np.arange(n) / source.step for n in shape)
     upper, left = row.astype(int), col.astype(int)

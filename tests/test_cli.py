@@ -31,7 +31,7 @@ from meshreg.cli.arguments import Axes
 from meshreg.cli.options import for_both, join_settings, read_options
 from meshreg.doctor import Check, run_probe
 from meshreg.errors import InputError, UsageError
-from meshreg.io.document import read_registration
+from meshreg.io.result.document import read_registration
 from meshreg.records import Grid, Maps, Mesh, PointCloud, Survey, Transform
 from meshreg.settings import Settings
 

@@ -146,11 +146,11 @@ def test_rasters_larger_than_memory_are_refused_before_the_work(monkeypatch):
         {"raster.dem_cell": 0.1, "raster.ortho_cell": 0.05, "raster.sift_cell": 0.01}
     )
     needed = 2 * 11 * 2 * 400 * (100 + 400 + 10_000) + 10 * 400 * 10_000
-    monkeypatch.setattr("meshreg.io.safe.free_memory", lambda: needed)
+    monkeypatch.setattr("meshreg.io.files.safe.free_memory", lambda: needed)
     pairing.require_memory(pair, settings)
-    monkeypatch.setattr("meshreg.io.safe.free_memory", lambda: int(0.95 * needed))
+    monkeypatch.setattr("meshreg.io.files.safe.free_memory", lambda: int(0.95 * needed))
     with pytest.raises(ResourceLimitError, match=r"0\.2 GB at least.*--dem-cell"):
         pairing.require_memory(pair, settings)
     pairing.require_memory(pair, settings.changed({"methods": "terrain"}))  # no SIFT: less
-    monkeypatch.setattr("meshreg.io.safe.free_memory", lambda: None)
+    monkeypatch.setattr("meshreg.io.files.safe.free_memory", lambda: None)
     pairing.require_memory(pair, settings)

@@ -13,7 +13,7 @@ import seafloor
 from meshreg import Mesh, PointCloud, Settings, Survey, apply_transform, register_pair
 from meshreg.errors import UsageError
 from meshreg.height.lifting import STABLE, rotation
-from meshreg.io.evidence import read_evidence, write_evidence
+from meshreg.io.result.evidence import read_evidence, write_evidence
 from meshreg.pipeline.compare import APART
 from meshreg.records import Transform
 from meshreg.refine.surfaces import Polished

@@ -12,7 +12,7 @@ from test_pipeline import QUICK, displaced, floors
 from test_pipeline import survey as ground
 
 from meshreg import Mesh, PointCloud, Survey, register_pair
-from meshreg.io.axes import ENU, NED, Y_UP
+from meshreg.io.frames.axes import ENU, NED, Y_UP
 from meshreg.pipeline.postures import AXES, in_degrees, level_axes, other_axes, posture
 from meshreg.records import Frame, Grid, Maps, SourceFile
 

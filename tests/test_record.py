@@ -19,8 +19,8 @@ from made_registration import EAST, NORTH, OFFSET, YAW, made_registration
 
 import meshreg
 from meshreg.errors import InputError, UsageError
-from meshreg.io.document import SCHEMA, registration_document, to_json
-from meshreg.io.record import matrix_text, read_registration, write_registration
+from meshreg.io.result.document import SCHEMA, registration_document, to_json
+from meshreg.io.result.record import matrix_text, read_registration, write_registration
 from meshreg.records import Frame, Mesh, PointCloud, Registration, SourceFile, Survey
 from meshreg.settings import Settings, read_settings
 
@@ -247,7 +247,7 @@ def survey(path: Path, frame: Frame, crs: str | None = None) -> Survey:
     local = np.array([[1.0, 2, 3], [21, 2, 3], [1, 22, 4], [21, 22, 4]])
     absolute = local @ frame.axes.T + frame.shift
     mesh = Mesh(absolute - absolute[0], np.array([[0, 1, 2], [1, 3, 2]]))
-    from meshreg.io.safe import fingerprint, sha256
+    from meshreg.io.files.safe import fingerprint, sha256
 
     source = SourceFile(path, "obj", frame, sha256=sha256(path), fingerprint=fingerprint(path))
     return Survey(path.stem, mesh, absolute[0], crs=crs, source=(source,))

@@ -26,8 +26,8 @@ from PIL import Image
 from meshreg.cli import app as cli
 from meshreg.cli.reporting import add_report, keep_evidence, write_report
 from meshreg.errors import InputError, ResourceLimitError, UsageError
-from meshreg.io.evidence import NAME, read_evidence, write_evidence
-from meshreg.io.record import read_registration, write_registration
+from meshreg.io.result.evidence import NAME, read_evidence, write_evidence
+from meshreg.io.result.record import read_registration, write_registration
 from meshreg.records import Grid, Registration, SurveyRaster, Transform, Warp
 from meshreg.report import (
     Result,
@@ -482,7 +482,7 @@ def test_only_a_changed_result_is_blamed_for_a_page_that_fails(
     results: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, state: str
 ) -> None:
     import meshreg.report
-    from meshreg.io.manifest import write_manifest
+    from meshreg.io.result.manifest import write_manifest
 
     folder = shutil.copytree(results["accepted"], tmp_path / "r")
     if state != "no manifest":

@@ -42,7 +42,7 @@ def test_methods_that_are_not_asked_cost_nothing():
 
 def test_the_radius_that_the_refusal_names_is_the_largest_that_fits(monkeypatch):
     pair = grids(30, 30, 0.03)
-    monkeypatch.setattr("meshreg.io.safe.free_memory", lambda: 6e9)
+    monkeypatch.setattr("meshreg.io.files.safe.free_memory", lambda: 6e9)
     with pytest.raises(ResourceLimitError, match=r"search\.radius 30 m") as caught:
         require_search(pair, Settings(), 30.0)
     radius = float(re.search(r"--search-radius ([\d.]+)", str(caught.value))[1])
@@ -56,7 +56,7 @@ def test_the_radius_that_the_refusal_names_is_the_largest_that_fits(monkeypatch)
 def test_what_the_refusal_names_fits(free, monkeypatch):
     """A hundred metres on both sides at 1 cm, sought to 100 m: the remedies are true ones."""
     pair = grids(100, 100, 0.01)
-    monkeypatch.setattr("meshreg.io.safe.free_memory", lambda: free)
+    monkeypatch.setattr("meshreg.io.files.safe.free_memory", lambda: free)
     with pytest.raises(ResourceLimitError, match=r"search\.radius 100 m") as caught:
         require_search(pair, Settings(), 100.0)
     assert caught.value.exit_code == 5
@@ -67,7 +67,7 @@ def test_what_the_refusal_names_fits(free, monkeypatch):
     )
     coarser = {"dem": grids(100, 100, dem)["dem"], "ortho": grids(100, 100, 2 * ortho)["ortho"]}
     assert require_search(coarser, Settings(), 100.0).memory <= free
-    monkeypatch.setattr("meshreg.io.safe.free_memory", lambda: None)
+    monkeypatch.setattr("meshreg.io.files.safe.free_memory", lambda: None)
     require_search(pair, Settings(), 100.0)
 
 
@@ -76,7 +76,7 @@ def test_a_refused_search_has_not_begun(monkeypatch):
     points = np.column_stack([rng.uniform(0, 20, (4000, 2)), rng.normal(0, 0.1, 4000)])
     pair = Survey("a", PointCloud(points)), Survey("b", PointCloud(points + 0.5))
     begun = []
-    monkeypatch.setattr("meshreg.io.safe.free_memory", lambda: 1_000_000)
+    monkeypatch.setattr("meshreg.io.files.safe.free_memory", lambda: 1_000_000)
     with pytest.raises(ResourceLimitError, match=r"0\.0 GB are free"):
         register_pair(*pair, progress=lambda stage, fraction: begun.append(stage))
     assert not begun

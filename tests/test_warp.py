@@ -22,7 +22,7 @@ from meshreg.deformation.ladder import FALL, Sample, choose, climb, intervals, s
 from meshreg.deformation.warp_rasters import common_value, warped_raster
 from meshreg.errors import InputError, UsageError
 from meshreg.io import read_survey, require_warpable, rewrite_survey, write_survey
-from meshreg.io.document import read_registration, registration_document, to_json
+from meshreg.io.result.document import read_registration, registration_document, to_json
 from meshreg.raster import rasterize
 from meshreg.records import (
     Grid,

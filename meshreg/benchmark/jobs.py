@@ -15,7 +15,7 @@ from data_synth.make import make_pair, write_pair
 from data_synth.recipe import Recipe
 from meshreg.benchmark import hand, maps, measure, rasters
 from meshreg.benchmark.plan import Job, key_of, recipe_of, settings_of, site_job
-from meshreg.io.atomic import atomic_file
+from meshreg.io.files.atomic import atomic_file
 from meshreg.records import Registration, Survey
 
 Record = dict[str, Any]
@@ -137,7 +137,7 @@ def _survey_file(paths: tuple[Path, ...], name: str) -> Path:
 
 
 def _register(job: Job, reference: Survey, moving: Survey, preset: str) -> Registration:
-    from meshreg.io.frames import common_crs
+    from meshreg.io.frames.place import common_crs
     from meshreg.pipeline import register_pair
 
     moving, _ = common_crs(reference, moving)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from meshreg.io.atomic import atomic_file
+from meshreg.io.files.atomic import atomic_file
 from meshreg.records import OffsetEstimate, Registration, SurveyRaster
 from meshreg.report import evidence, overlays, style
 

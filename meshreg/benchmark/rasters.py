@@ -12,7 +12,7 @@ import numpy as np
 from data_synth.rasters import RasterPair, make_rasters
 from meshreg.benchmark.plan import DEM_CELL, ORTHO_CELL, SIFT_CELL, Job, recipe_of
 from meshreg.heading import Turn, turning
-from meshreg.io.atomic import atomic_file
+from meshreg.io.files.atomic import atomic_file
 from meshreg.raster import rasterize
 from meshreg.raster.grid import coarsened, survey_grid
 from meshreg.records import Grid, Maps, Survey, SurveyRaster, Transform

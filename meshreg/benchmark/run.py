@@ -17,9 +17,9 @@ from meshreg.benchmark.plan import SCHEMA, Job, Options, jobs
 from meshreg.benchmark.summary import summarise
 from meshreg.benchmark.workers import run_all
 from meshreg.errors import UsageError
-from meshreg.io import manifest
-from meshreg.io.atomic import as_output_error, atomic_file
-from meshreg.io.manifest import require_only_ours, require_ours, write_manifest
+from meshreg.io.files.atomic import as_output_error, atomic_file
+from meshreg.io.result import manifest
+from meshreg.io.result.manifest import require_only_ours, require_ours, write_manifest
 
 log = logging.getLogger(__name__)
 Progress = Callable[[str, int, int], None]

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from meshreg.benchmark.plan import CROSSING, FLAT, PAPER_SITES
-from meshreg.io.atomic import atomic_file
+from meshreg.io.files.atomic import atomic_file
 from meshreg.settings import METHODS
 
 Row = Mapping[str, Any]

@@ -131,7 +131,7 @@ def register(
     """
     del debug
     from meshreg.cli import registering, result
-    from meshreg.io.document import registration_document
+    from meshreg.io.result.document import registration_document
 
     settings = join_settings(
         preset,

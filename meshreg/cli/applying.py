@@ -42,9 +42,9 @@ class ApplyRequest:
 def apply(request: ApplyRequest, voice: Voice, unfinished: Unfinished) -> dict[str, Any]:
     """Move a further file of the moving survey by a registration that was found."""
     from meshreg.io import require_warpable, require_writable, rewrite_survey, unchanged
-    from meshreg.io.atomic import as_output_error
-    from meshreg.io.manifest import require_apart, survey_files
-    from meshreg.io.record import read_registration, reference_stand_in, to_json
+    from meshreg.io.files.atomic import as_output_error
+    from meshreg.io.result.manifest import require_apart, survey_files
+    from meshreg.io.result.record import read_registration, reference_stand_in, to_json
 
     registration = read_registration(request.registration)
     if registration.transform is None:
@@ -97,7 +97,7 @@ def _read_like(request: SurveyRequest, registration: Registration) -> tuple[Surv
     A file without a shift of its own that lies off the registered survey by exactly the shift
     which that one had was exported in the same local coordinates.
     """
-    from meshreg.io.frames import reframe
+    from meshreg.io.frames.place import reframe
 
     survey = read(request)
     if not survey.scale_known:
@@ -131,7 +131,7 @@ def _as_registered(survey: Survey, registration: Registration) -> tuple[Survey, 
     UsageError
         It is another model: nothing says how the frames of the two lie to each other.
     """
-    from meshreg.io.mover import to_absolute, to_file
+    from meshreg.io.frames.mover import to_absolute, to_file
 
     said = registration.moving
     if survey.source[0].sha256 not in (said.get("sha256") or ()) or said.get("axes") is None:

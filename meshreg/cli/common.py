@@ -69,9 +69,9 @@ def new_folder(new: NewFolder, unfinished: Unfinished) -> Iterator[Path]:
 
     That the folder can be written and the disk is not full is found out here, before the work.
     """
-    from meshreg.io.atomic import as_output_error
-    from meshreg.io.folders import atomic_folder
-    from meshreg.io.manifest import require_apart
+    from meshreg.io.files.atomic import as_output_error
+    from meshreg.io.result.folders import atomic_folder
+    from meshreg.io.result.manifest import require_apart
 
     with as_output_error(new.out):
         require_apart(new.out, new.inputs)
@@ -168,7 +168,7 @@ def read_masks(said: Sequence[str], surveys: Mapping[str, Survey]) -> dict[str, 
     coordinates are those of the survey that it holds for, as that came (before it was taken to the
     reference's CRS).
     """
-    from meshreg.io.masks import read_mask
+    from meshreg.io.masks.read import read_mask
 
     found: dict[str, list[Callable[[Any], Any]]] = {"reference": [], "moving": []}
     for text in said:

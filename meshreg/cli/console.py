@@ -54,7 +54,7 @@ class Voice:
 
     def document(self, document: Any) -> None:
         """Print a JSON document on stdout; nothing else may be there."""
-        from meshreg.io.document import to_json
+        from meshreg.io.result.document import to_json
 
         text = to_json(document)
         try:

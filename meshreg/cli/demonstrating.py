@@ -113,7 +113,7 @@ def introduce(real_pair: bool, voice: Voice) -> None:
 
 def document(done: Demonstration) -> dict[str, Any]:
     """Return the registration as `meshreg register --json` does, the errors among its notes."""
-    from meshreg.io.document import registration_document
+    from meshreg.io.result.document import registration_document
 
     registration = done.registration
     if done.errors is not None:

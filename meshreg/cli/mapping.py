@@ -37,8 +37,8 @@ class RasterizeRequest:
 
 def rasterize(request: RasterizeRequest, voice: Voice, unfinished: Unfinished) -> dict[str, Any]:
     """Write dem.tif and ortho.tif of one survey; say what they are."""
-    from meshreg.io.manifest import require_apart, survey_files
-    from meshreg.io.maps import local_crs, write_raster
+    from meshreg.io.maps.pair import local_crs, write_raster
+    from meshreg.io.result.manifest import require_apart, survey_files
     from meshreg.raster import rasterize as make_raster
     from meshreg.raster.grid import choose_cells, survey_grid
 

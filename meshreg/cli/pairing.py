@@ -11,7 +11,7 @@ import numpy as np
 from meshreg.cli.common import SurveyRequest
 from meshreg.cli.info import plane, remarks
 from meshreg.errors import ResourceLimitError, UsageError
-from meshreg.io.axes import UNITS
+from meshreg.io.frames.axes import UNITS
 from meshreg.pipeline import in_degrees
 from meshreg.records import Float64, Maps, Registration, Survey
 from meshreg.settings import Settings
@@ -56,7 +56,7 @@ def require_memory(surveys: tuple[Survey, Survey], settings: Settings) -> None:
     ResourceLimitError
         That is more than is free.
     """
-    from meshreg.io.safe import free_memory
+    from meshreg.io.files.safe import free_memory
     from meshreg.raster.grid import choose_cells, survey_bounds
 
     cells = choose_cells(*surveys, settings.raster)

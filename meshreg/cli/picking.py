@@ -133,7 +133,7 @@ def _desk_of_result(request: PickRequest, folder: Path) -> Desk:
 def _desk_of_surveys(
     request: PickRequest, moving_request: SurveyRequest, folder: Path, progress: Progress
 ) -> Desk:
-    from meshreg.io.frames import common_crs
+    from meshreg.io.frames.place import common_crs
     from meshreg.raster.grid import choose_cells
     from meshreg.ties.desk import Desk
     from meshreg.ties.pictures import write_picture

@@ -66,8 +66,8 @@ def register(request: RegisterRequest, voice: Voice, unfinished: Unfinished) -> 
 def register_into(folder: Path, request: RegisterRequest, progress: Progress) -> Registration:
     """Read, register, write everything into a folder that is there already."""
     from meshreg.io import require_writable, rewrite_survey, unchanged
-    from meshreg.io.frames import common_crs
-    from meshreg.io.manifest import require_apart, survey_files
+    from meshreg.io.frames.place import common_crs
+    from meshreg.io.result.manifest import require_apart, survey_files
     from meshreg.records import Maps
 
     _log_start(request)
@@ -89,7 +89,7 @@ def register_into(folder: Path, request: RegisterRequest, progress: Progress) ->
         require_disk(folder, moving)
         pairing.require_memory((reference, moving), request.settings)
         reading = time.perf_counter() - clock
-        from meshreg.io.record import with_frames, write_record_files
+        from meshreg.io.result.record import with_frames, write_record_files
         from meshreg.pipeline import register_pair
 
         moved: list[Future[tuple[Path, ...]]] = []

@@ -42,7 +42,7 @@ def add_report(registration: Registration, folder: Path) -> None:
 
 def keep_evidence(registration: Registration, folder: Path) -> None:
     """Save in a result's folder what its page needs beyond the record."""
-    from meshreg.io.evidence import write_evidence
+    from meshreg.io.result.evidence import write_evidence
     from meshreg.report import keep
 
     if kept := keep(registration):
@@ -61,9 +61,9 @@ def write_report(folder: Path) -> Path:
     OutputError
         If the page cannot be written.
     """
-    from meshreg.io.evidence import read_evidence
-    from meshreg.io.manifest import require_ours, write_into
-    from meshreg.io.record import read_registration
+    from meshreg.io.result.evidence import read_evidence
+    from meshreg.io.result.manifest import require_ours, write_into
+    from meshreg.io.result.record import read_registration
     from meshreg.report import gather, report_page
 
     folder = _result_folder(folder)
@@ -87,7 +87,7 @@ def remake_report(folder: Path) -> Path:
         with in_place():
             return write_report(folder)
     except (ArithmeticError, LookupError, TypeError, ValueError, AttributeError) as error:
-        from meshreg.io.manifest import are_as_written
+        from meshreg.io.result.manifest import are_as_written
 
         if are_as_written(
             Path(folder), [name for name in _SAVED if (Path(folder) / name).exists()]
@@ -114,7 +114,7 @@ def _result_folder(folder: Path) -> Path:
 
 def view(folder: Path) -> None:
     """Show both surfaces of a result in a window; return when it is closed."""
-    from meshreg.io.evidence import read_evidence
+    from meshreg.io.result.evidence import read_evidence
     from meshreg.report import open_view
 
     folder = _result_folder(folder)

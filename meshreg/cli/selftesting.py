@@ -51,8 +51,8 @@ def selftest(request: SelftestRequest, voice: Voice, unfinished: Unfinished) -> 
         with logging_to(voice, log), Progress(voice) as progress:
             document = _tested(request, progress)
         if folder is not None:
-            from meshreg.io.atomic import as_output_error
-            from meshreg.io.document import to_json
+            from meshreg.io.files.atomic import as_output_error
+            from meshreg.io.result.document import to_json
 
             with as_output_error(folder / FILE):
                 (folder / FILE).write_text(to_json(document), encoding="utf-8")
@@ -72,8 +72,8 @@ def _folder(request: SelftestRequest, unfinished: Unfinished) -> Iterator[Path |
 
 
 def _tested(request: SelftestRequest, progress: Progress) -> dict[str, Any]:
-    from meshreg.io.frames import common_crs
-    from meshreg.io.manifest import require_apart, survey_files
+    from meshreg.io.frames.place import common_crs
+    from meshreg.io.result.manifest import require_apart, survey_files
     from meshreg.pipeline import self_test
 
     progress("read", 0.0)

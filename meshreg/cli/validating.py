@@ -42,8 +42,8 @@ class ValidateRequest:
 
 def validate(request: ValidateRequest) -> dict[str, Any]:
     """Compare, write validation.json, .html and figures into OUT, say so in its report.html."""
-    from meshreg.io.document import read_registration, to_json
-    from meshreg.io.manifest import require_ours, write_into
+    from meshreg.io.result.document import read_registration, to_json
+    from meshreg.io.result.manifest import require_ours, write_into
     from meshreg.ties.figure import draw_validation
     from meshreg.ties.page import sentence, validation_page
     from meshreg.ties.placing import read_placing
@@ -103,8 +103,8 @@ def read_pairs(
 
 def about_files(ties: str) -> dict[str, Any]:
     """Names and checksums of the files that pairs come from."""
+    from meshreg.io.files.safe import sha256
     from meshreg.io.finding import split_pair
-    from meshreg.io.safe import sha256
 
     paths = (Path(ties),) if Path(ties).is_file() else split_pair(ties)
     return {"files": [p.name for p in paths], "sha256": [sha256(p) for p in paths]}
@@ -164,7 +164,7 @@ def _delivered(placing: Placing, flat: ToMetres) -> ToMetres:
 
 
 def _pixels(path: Path) -> ToMetres:
-    from meshreg.io.geotiff import lattice, opened
+    from meshreg.io.maps.geotiff import lattice, opened
 
     with opened(path, 1 << 62) as dataset:
         matrix = lattice(dataset, path)
@@ -177,7 +177,7 @@ def _pixels(path: Path) -> ToMetres:
 
 def _turned(out: Path) -> tuple[float, float] | None:
     """Degrees and scale by which the survey was turned before the methods looked at it."""
-    from meshreg.io.evidence import read_evidence
+    from meshreg.io.result.evidence import read_evidence
 
     try:
         turned = read_evidence(out).get("meta", {}).get("turned")

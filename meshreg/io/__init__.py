@@ -1,6 +1,6 @@
 """READ and WRITE: the only place that opens a survey file.
 
-`formats` has the tables of what is read, written and rewritten by which module.
+A format is a folder with a `Format`; `formats` is the table of them all.
 """
 
 from __future__ import annotations
@@ -12,18 +12,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from meshreg.errors import InputError, UsageError
-from meshreg.io.formats import CHECKS, READERS, REWRITERS, WRITERS, load
+from meshreg.io.formats import FORMATS, READERS, WRITERS, load
 from meshreg.io.options import ReadOptions
 
 if TYPE_CHECKING:
-    from meshreg.io.record import read_registration as read_registration
-    from meshreg.io.record import write_registration as write_registration
+    from meshreg.io.result.record import read_registration as read_registration
+    from meshreg.io.result.record import write_registration as write_registration
     from meshreg.records import Survey, Transform, Warp
 
 
 def __getattr__(name: str) -> Any:
     if name in ("read_registration", "write_registration"):
-        return getattr(importlib.import_module("meshreg.io.record"), name)
+        return getattr(importlib.import_module("meshreg.io.result.record"), name)
     raise AttributeError(f"module 'meshreg.io' has no attribute {name!r}")
 
 
@@ -85,7 +85,7 @@ def _require_near(survey: Survey) -> None:
     """Refuse coordinates beyond measure, whichever reader they came through."""
     import numpy as np
 
-    from meshreg.io.safe import FARTHEST
+    from meshreg.io.files.safe import FARTHEST
 
     farthest = float(np.abs(survey.bounds).max())
     if not farthest < FARTHEST:  # NaN too
@@ -211,7 +211,7 @@ def unchanged(survey: Survey) -> None:
         A file is gone, or sizes or times of change differ, and so does the checksum of a file
         that stands alone.
     """
-    from meshreg.io.safe import fingerprint, sha256
+    from meshreg.io.files.safe import fingerprint, sha256
 
     for source in survey.source:
         if not source.sha256:
@@ -243,9 +243,8 @@ def same_files(reference: Survey, moving: Survey) -> str | None:
 
 
 __all__ = [
-    "CHECKS",
+    "FORMATS",
     "READERS",
-    "REWRITERS",
     "WRITERS",
     "ReadOptions",
     "load",

@@ -12,12 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from meshreg.errors import InputError
-from meshreg.io.frames import Placed, place
-from meshreg.io.images import require_pages
+from meshreg.io.files.images import require_pages
+from meshreg.io.files.safe import FARTHEST, fingerprint, sha256
+from meshreg.io.frames.place import Placed, place
+from meshreg.io.frames.sidecar import SidecarInfo
+from meshreg.io.masks.polygons import usable_faces
 from meshreg.io.options import ReadOptions
-from meshreg.io.polygons import usable_faces
-from meshreg.io.safe import FARTHEST, fingerprint, sha256
-from meshreg.io.sidecar import SidecarInfo
 from meshreg.records import (
     Bool,
     Int32,
@@ -72,7 +72,7 @@ class Found:
     Attributes
     ----------
     format : str
-        Key in `meshreg.io.REWRITERS`.
+        Key in `meshreg.io.formats.BY_KEY`.
     notes : tuple of str
     companions : tuple of Path
     counts : mapping
@@ -241,7 +241,7 @@ def _without_idle_faces(raw: RawGeometry, path: Path) -> tuple[RawGeometry, tupl
     assert raw.faces is not None
     if not len(raw.faces):
         raise InputError("holds no usable face.", file=path, remedy="Export it again.")
-    from meshreg.io.faces_kernels import mark_used
+    from meshreg.io.files.faces_kernels import mark_used
 
     used = np.zeros(len(raw.points), np.bool_)
     mark_used(raw.faces, used)

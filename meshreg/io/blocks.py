@@ -10,14 +10,14 @@ from typing import cast
 import numpy as np
 
 from meshreg.errors import InputError, OutputError, UsageError
+from meshreg.io.files.naming import Planned, planned
+from meshreg.io.files.safe import data_errors, fingerprint, sha256
 from meshreg.io.finding import Block, find_blocks
-from meshreg.io.formats import CHECKS, READERS, REWRITERS, load
-from meshreg.io.frames import make_mover, registered_frame, to_file
-from meshreg.io.mover import Mover, is_plain
-from meshreg.io.naming import Planned, planned
+from meshreg.io.formats import BY_KEY, READERS, load
+from meshreg.io.frames.mover import Mover, is_plain
+from meshreg.io.frames.place import make_mover, registered_frame, to_file
+from meshreg.io.frames.sidecar import write_metadata, write_shift
 from meshreg.io.options import ReadOptions
-from meshreg.io.safe import data_errors, fingerprint, sha256
-from meshreg.io.sidecar import write_metadata, write_shift
 from meshreg.records import Float64, Frame, SourceFile, Survey, Transform, Warp
 
 __all__ = ["Block", "find_blocks", "read_block", "require_warpable", "require_writable", "rewrite"]
@@ -55,10 +55,9 @@ def _recorded(source: SourceFile) -> SourceFile:
 def require_warpable(survey: Survey) -> None:
     """Do `meshreg.io.require_warpable`."""
     for source in survey.source:
-        if source.format in ("glb", "gltf", "colmap"):
-            kind = "COLMAP models are" if source.format == "colmap" else "glTF files are"
+        if whole := BY_KEY[source.format].whole:
             raise UsageError(
-                f"cannot be warped: {kind} moved as a whole.",
+                f"cannot be warped: {whole} moved as a whole.",
                 file=source.path,
                 remedy="Export the survey as .obj, .ply or .laz, or register with --warp none.",
             )
@@ -67,7 +66,7 @@ def require_warpable(survey: Survey) -> None:
 def require_writable(survey: Survey, reference: Survey | None = None) -> None:
     """Do `meshreg.io.require_writable`."""
     for plan, mover in _plans(survey, Transform(), reference, "_registered"):
-        if (entry := CHECKS.get(plan.source.format)) is not None:
+        if entry := BY_KEY[plan.source.format].require_writable:
             load(entry)(plan.source, mover, _sample(survey, plan.source))
 
 
@@ -125,7 +124,7 @@ def rewrite(
         source, target = plan.source, mover.frame
         path = folder / plan.name
         with data_errors(source.path):
-            written += load(REWRITERS[source.format])(source, mover, path)
+            written += load(BY_KEY[source.format].rewrite)(source, mover, path)
         if source.format != "maps":
             in_file = source.format == "e57" or (source.format == "las" and is_plain(target))
             written += write_shift(path, target, carries_crs=in_file)

@@ -11,20 +11,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from meshreg.errors import InputError, UsageError
-from meshreg.io.formats import READERS
-from meshreg.io.safe import open_regular, require_inside
-from meshreg.io.sidecar import is_sidecar
+from meshreg.io.files.safe import open_regular, require_inside
+from meshreg.io.formats import MAGIC, READERS
+from meshreg.io.frames.sidecar import is_sidecar
 
-_MAGIC = (
-    (b"ply", "PLY", (".ply",)),
-    (b"glTF", "binary glTF", (".glb",)),
-    (b"LASF", "LAS", (".las", ".laz")),
-    (b"ASTM-E57", "E57", (".e57",)),
-    (b"II*\0", "TIFF", (".tif", ".tiff")),
-    (b"MM\0*", "TIFF", (".tif", ".tiff")),
-    (b"II+\0", "TIFF", (".tif", ".tiff")),
-    (b"MM\0+", "TIFF", (".tif", ".tiff")),
-)
 _FOREIGN = (
     (b"PK\x03\x04", "a ZIP archive (.zip, .npz, .kmz)"),
     (b"\x1f\x8b", "a gzip archive"),
@@ -186,7 +176,7 @@ def _file_block(path: Path) -> Block:
         head = stream.read(16)
     if not head:
         raise InputError("is empty.", file=path, remedy="Export or copy it again.")
-    known = [(name, suffixes) for magic, name, suffixes in _MAGIC if _starts(head, magic)]
+    known = [(name, suffixes) for magic, name, suffixes in MAGIC if _starts(head, magic)]
     for name, suffixes in known:
         if suffix not in suffixes:
             called = f"is called {path.suffix}" if suffix else "has no suffix"
@@ -205,7 +195,7 @@ def _file_block(path: Path) -> Block:
             file=path,
             remedy=f"Surveys are read as {', '.join(key for key in READERS if key)}.",
         )
-    wanted = [name for _, name, suffixes in _MAGIC if suffix in suffixes]
+    wanted = [name for _, name, suffixes in MAGIC if suffix in suffixes]
     if wanted and not known:
         raise InputError(
             f"is called {suffix}, but does not start as {wanted[0]} does.",

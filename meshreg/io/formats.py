@@ -1,71 +1,25 @@
-"""The tables of formats: a new one is its module and its lines here.
-
-Each entry names a function by "module:function", imported at first use.
-"""
+"""The table of formats: a new one is its folder with a `Format`, and its name here."""
 
 from __future__ import annotations
 
-import importlib
-from collections.abc import Callable
-from typing import Any
+from meshreg.io import colmap, e57, gltf, las, maps, obj, other, ply, text
+from meshreg.io.format import Format, load
 
-READERS: dict[str, str] = {
-    ".obj": "meshreg.io.obj:read",
-    ".ply": "meshreg.io.ply:read",
-    ".glb": "meshreg.io.gltf:read",
-    ".gltf": "meshreg.io.gltf:read",
-    ".stl": "meshreg.io.stl:read",
-    ".off": "meshreg.io.off:read",
-    ".las": "meshreg.io.cloud:read",
-    ".laz": "meshreg.io.cloud:read",
-    ".e57": "meshreg.io.e57:read",
-    ".xyz": "meshreg.io.xyz:read",
-    ".csv": "meshreg.io.xyz:read",
-    ".txt": "meshreg.io.xyz:read",
-    ".asc": "meshreg.io.xyz:read",
-    ".pts": "meshreg.io.xyz:read",
-    ".tif": "meshreg.io.maps:read",
-    ".tiff": "meshreg.io.maps:read",
-    "": "meshreg.io.colmap:read",  # a folder
-}
-WRITERS: dict[str, str] = {
-    ".obj": "meshreg.io.obj:write",
-    ".ply": "meshreg.io.ply:write",
-    ".glb": "meshreg.io.gltf:write",
-    ".stl": "meshreg.io.stl:write",
-    ".off": "meshreg.io.off:write",
-    ".las": "meshreg.io.cloud_write:write",
-    ".laz": "meshreg.io.cloud_write:write",
-    ".e57": "meshreg.io.e57:write",
-    ".xyz": "meshreg.io.xyz:write",
-    ".csv": "meshreg.io.xyz:write",
-    ".txt": "meshreg.io.xyz:write",
-    ".tif": "meshreg.io.maps:write",
-    ".tiff": "meshreg.io.maps:write",
-}
-REWRITERS: dict[str, str] = {
-    "obj": "meshreg.io.obj:rewrite",
-    "ply": "meshreg.io.ply:rewrite",
-    "glb": "meshreg.io.gltf:rewrite",
-    "gltf": "meshreg.io.gltf:rewrite",
-    "stl": "meshreg.io.stl:rewrite",
-    "off": "meshreg.io.off:rewrite",
-    "las": "meshreg.io.cloud_write:rewrite",
-    "e57": "meshreg.io.e57:rewrite",
-    "xyz": "meshreg.io.xyz:rewrite",
-    "colmap": "meshreg.io.colmap:rewrite",
-    "maps": "meshreg.io.maps:rewrite",
-}
-# What is found out about a file before the work that could otherwise fail at its end.
-CHECKS: dict[str, str] = {
-    "glb": "meshreg.io.gltf_rewrite:require_writable",
-    "gltf": "meshreg.io.gltf_rewrite:require_writable",
-    "colmap": "meshreg.io.colmap:require_writable",
-}
+FORMATS: tuple[Format, ...] = (
+    obj.FORMAT,
+    ply.FORMAT,
+    gltf.FORMAT,
+    other.STL,
+    other.OFF,
+    las.FORMAT,
+    e57.FORMAT,
+    text.FORMAT,
+    maps.FORMAT,
+    colmap.FORMAT,
+)
+BY_KEY = {key: known for known in FORMATS for key in known.keys}
+READERS = {suffix: known.read for known in FORMATS for suffix in known.suffixes}
+WRITERS = {suffix: known.write for known in FORMATS for suffix in known.written}
+MAGIC = tuple(line for known in FORMATS for line in known.magic)
 
-
-def load(entry: str) -> Callable[..., Any]:
-    """Import the function that a table's "module:function" names."""
-    module, _, name = entry.partition(":")
-    function: Callable[..., Any] = getattr(importlib.import_module(module), name)
-    return function
+__all__ = ["BY_KEY", "FORMATS", "MAGIC", "READERS", "WRITERS", "Format", "load"]

@@ -9,7 +9,7 @@ from typing import Any, cast
 import numpy as np
 
 from meshreg.errors import InputError
-from meshreg.io.frames import reframe
+from meshreg.io.frames.place import reframe
 from meshreg.records import Maps, Mesh, PointCloud, Survey
 
 

@@ -17,7 +17,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from meshreg.errors import OutputError
-from meshreg.io.safe import open_regular
+from meshreg.io.files.safe import open_regular
 from meshreg.records import Float64
 
 _BLOCK = 1 << 24

@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from meshreg.errors import ResourceLimitError
-from meshreg.io import safe
+from meshreg.io.files import safe
 from meshreg.offsets.correlate import Window
 from meshreg.offsets.mutual_information import SINGLE_CELLS
 from meshreg.pipeline.narrowing import cut_sizes, margin, narrowing

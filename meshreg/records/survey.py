@@ -30,7 +30,7 @@ class Frame:
         The CRS that ``axes @ file + shift`` is in ("EPSG:32754" or WKT), if known.
     crs : str or None
         The metric CRS of absolute coordinates. Where it differs from `file_crs`, points pass
-        through PROJ after the shift (`meshreg.io.frames`).
+        through PROJ after the shift (`meshreg.io.frames.place`).
     local : str or None
         WKT of a local (engineering) CRS that the file states. It says nothing about the place on
         Earth and is used for nothing but to be written again.
@@ -58,7 +58,7 @@ class SourceFile:
 
     `companions` are the files it refers to (MTL, texture pages), in the order of reference;
     `fingerprint` is (size in bytes, mtime in ns) when it was read. `copies` names the copies of
-    those companions that cannot keep their names beside the moved file (`meshreg.io.naming`).
+    those companions that cannot keep their names beside the moved file (`meshreg.io.files.naming`).
     """
 
     path: Path

@@ -79,7 +79,7 @@ def read_markers(
 
 def _stated_crs(path: Path) -> tuple[str | None, tuple[str, ...]]:
     """Return the CRS that a comment of Metashape's states; None where there is none to tell."""
-    from meshreg.io.crs import parse_crs
+    from meshreg.io.frames.crs import parse_crs
 
     for text in read_text(path).splitlines():
         wkt = _WKT.search(text.replace('""', '"')) if text.lstrip(' "').startswith("#") else None
@@ -108,8 +108,8 @@ def _moved(
     """Take points from the CRS that their file states to the surveys'."""
     if not points or stated is None or stated == crs:
         return points
-    from meshreg.io.bridge import bridge
-    from meshreg.io.crs import is_geographic
+    from meshreg.io.frames.bridge import bridge
+    from meshreg.io.frames.crs import is_geographic
 
     if crs is None:
         if not is_geographic(stated):

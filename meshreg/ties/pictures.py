@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from meshreg.errors import InputError
-from meshreg.io.geotiff_write import write_color
+from meshreg.io.maps.write import write_color
 from meshreg.records import Bool, Float64, Grid, Maps, Survey, UInt8
 from meshreg.report.style import hillshade
 from meshreg.settings import RasterSettings
@@ -57,7 +57,7 @@ def write_relief(dem: Path, path: Path) -> None:
     InputError
         It is no DEM.
     """
-    from meshreg.io.geotiff_values import read_height
+    from meshreg.io.maps.values import read_height
 
     raw = read_height(dem, 1 << 62)
     (cell, _, west), (_, _, north) = raw.matrix.tolist()

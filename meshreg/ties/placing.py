@@ -81,7 +81,7 @@ def read_placing(folder: str | Path) -> Placing:
     InputError
         No registration, or a rejected one.
     """
-    from meshreg.io.document import read_registration
+    from meshreg.io.result.document import read_registration
 
     folder = Path(folder)
     registration = read_registration(folder)
@@ -98,7 +98,7 @@ def read_placing(folder: str | Path) -> Placing:
 
 
 def _heights(path: Path) -> HeightAt:
-    from meshreg.io.geotiff_values import read_height
+    from meshreg.io.maps.values import read_height
 
     raw = read_height(path, 1 << 62)
     values = np.where(raw.valid, raw.values, np.nan)

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from meshreg.errors import MeshregError, OutputError
-from meshreg.io.checked_json import parse_json
+from meshreg.io.files.checked_json import parse_json
 from meshreg.ties.desk import Desk
 from meshreg.ties.guard import Guard
 from meshreg.ties.session import StaleError

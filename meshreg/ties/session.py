@@ -164,7 +164,7 @@ def only_one(path: Path) -> Iterator[None]:
     """
     import fcntl  # POSIX only
 
-    from meshreg.io.atomic import as_output_error
+    from meshreg.io.files.atomic import as_output_error
 
     lock = path.with_name(f".{path.name}.lock")
     with as_output_error(path):

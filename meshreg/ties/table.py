@@ -13,8 +13,8 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from meshreg.errors import InputError, UsageError
-from meshreg.io.atomic import as_output_error, atomic_file
-from meshreg.io.safe import open_regular
+from meshreg.io.files.atomic import as_output_error, atomic_file
+from meshreg.io.files.safe import open_regular
 from meshreg.ties.records import MAX_NAME, MAX_PAIRS, Point, TiePair, TiePoints
 
 COLUMNS = (

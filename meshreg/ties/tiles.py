@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from meshreg.errors import InputError
-from meshreg.io.geotiff import lattice, opened
+from meshreg.io.maps.geotiff import lattice, opened
 from meshreg.records import Bool, Float64, Grid, UInt8
 
 SIDE = 256  # pixels of a tile

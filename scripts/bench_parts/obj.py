@@ -46,7 +46,7 @@ def _best(read: Callable[[str], Any], small: str, path: str) -> dict[str, Any]:
 
 
 def meshreg(small: str, path: str) -> dict[str, Any]:
-    from meshreg.io.obj import read
+    from meshreg.io.obj.read import read
     from meshreg.io.options import ReadOptions
 
     return _best(lambda name: read(Path(name), ReadOptions()), small, path)

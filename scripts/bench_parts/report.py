@@ -24,7 +24,7 @@ def job(folder: str) -> dict[str, Any]:
     from meshreg.benchmark import rasters
     from meshreg.benchmark.plan import Job
     from meshreg.cli.reporting import keep_evidence, write_report
-    from meshreg.io.record import write_record_files
+    from meshreg.io.result.record import write_record_files
 
     def survey(name: str, dem: Any, ortho: Any) -> Any:
         height = dem.height + dem.datum

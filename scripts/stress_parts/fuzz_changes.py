@@ -294,7 +294,7 @@ def png(data: bytes, rng: random.Random, _: list[bytes]) -> bytes:
 
 def e57(data: bytes, rng: random.Random, others: list[bytes]) -> bytes:
     """Change the payload of an E57's pages or its XML, with the right checksums."""
-    from meshreg.io import e57_pages
+    from meshreg.io.e57 import pages as e57_pages
 
     try:
         pages = [data[at : at + 1020] for at in range(0, len(data), 1024)]

@@ -20,8 +20,8 @@ from data_synth.rasters import RasterPair, make_rasters
 from data_synth.recipe import load
 from data_synth.truth import common_points
 from meshreg.cli import app as cli
-from meshreg.io.document import registration_document, to_json
-from meshreg.io.maps import write_raster
+from meshreg.io.maps.pair import write_raster
+from meshreg.io.result.document import registration_document, to_json
 from meshreg.records import OffsetEstimate, Registration, Transform
 from meshreg.settings import Settings
 from meshreg.ties import read_ties

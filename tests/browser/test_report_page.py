@@ -14,7 +14,7 @@ from made_registration import EAST, NORTH, OFFSET, made_registration, relief
 from PIL import Image
 
 from meshreg.cli.reporting import keep_evidence, write_report
-from meshreg.io.record import write_registration
+from meshreg.io.result.record import write_registration
 from meshreg.report import keeping
 
 HOSTILE = "</script><img src=x onerror=document.title='owned'>[red]"

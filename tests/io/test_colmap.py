@@ -16,8 +16,10 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from meshreg.errors import InputError, OutputError, UsageError
-from meshreg.io import colmap, colmap_files, positions, similarity
-from meshreg.io.mover import make_mover
+from meshreg.io.colmap import files as colmap_files
+from meshreg.io.colmap import positions, similarity
+from meshreg.io.colmap import read as colmap
+from meshreg.io.frames.mover import make_mover
 from meshreg.io.options import ReadOptions
 from meshreg.records import Frame, Survey, Transform
 
@@ -652,7 +654,7 @@ def test_names_with_blanks_stay_whole(tmp_path, scene):
 
 @pytest.mark.parametrize("cut", ["IMG", "IMG (0003)"])
 def test_a_name_that_is_cut_in_writing_is_found(tmp_path, scene, cut, monkeypatch):
-    from meshreg.io import colmap_write
+    from meshreg.io.colmap import write as colmap_write
 
     scene.names = [f"IMG ({i:04d}) copy.JPG" for i in range(25)]
     survey = colmap.read(write_txt(tmp_path / "reef", scene), ReadOptions(scale=1))

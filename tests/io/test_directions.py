@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from meshreg.io.directions import Directions, find_directions, turn_columns
-from meshreg.io.mover import make_mover
+from meshreg.io.frames.directions import Directions, find_directions, turn_columns
+from meshreg.io.frames.mover import make_mover
 from meshreg.records import Frame, SourceFile, Transform
 
 RNG = np.random.default_rng(31)

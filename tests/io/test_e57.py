@@ -10,8 +10,11 @@ import numpy as np
 import pytest
 
 from meshreg.errors import InputError, OutputError, UnsafeReferenceError, UsageError
-from meshreg.io import e57, e57_pages, e57_scans, e57_xml
-from meshreg.io.mover import make_mover
+from meshreg.io.e57 import pages as e57_pages
+from meshreg.io.e57 import read as e57
+from meshreg.io.e57 import scans as e57_scans
+from meshreg.io.e57 import xml as e57_xml
+from meshreg.io.frames.mover import make_mover
 from meshreg.io.options import ReadOptions
 from meshreg.records import Frame, Mesh, PointCloud, Survey, Transform
 

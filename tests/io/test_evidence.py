@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from meshreg.errors import InputError
-from meshreg.io.evidence import NAME, read_evidence, write_evidence
+from meshreg.io.result.evidence import NAME, read_evidence, write_evidence
 
 PICTURE = np.frombuffer(b"\x89PNG\r\n\x1a\n", np.uint8)
 BOUNDS = [0.0, 0.0, 1.0, 1.0]

@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from meshreg.io.faces_kernels import mark_used, place_uvs, use_faces
+from meshreg.io.files.faces_kernels import mark_used, place_uvs, use_faces
 
 
 def used_by_kernel(points, faces):

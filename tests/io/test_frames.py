@@ -16,10 +16,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from meshreg.errors import InputError, UsageError
-from meshreg.io.axes import NED, UNITS, Y_UP
-from meshreg.io.bridge import bridge
-from meshreg.io.crs import crs_text, mend_proj_data, metric_crs
-from meshreg.io.frames import (
+from meshreg.io.frames.axes import NED, UNITS, Y_UP
+from meshreg.io.frames.bridge import bridge
+from meshreg.io.frames.crs import crs_text, mend_proj_data, metric_crs
+from meshreg.io.frames.place import (
     common_crs,
     frame_from,
     grid_scale_and_convergence,
@@ -246,7 +246,7 @@ def test_points_that_proj_cannot_move_are_refused():
 
 
 def test_two_crs_that_disagree_are_refused_unless_the_user_decides():
-    from meshreg.io.sidecar import SidecarInfo
+    from meshreg.io.frames.sidecar import SidecarInfo
 
     prj = SidecarInfo(path=Path("a.prj"), crs="EPSG:32755", crs_path=Path("a.prj"))
     with pytest.raises(InputError, match=r"EPSG:32754.*a\.prj says EPSG:32755"):

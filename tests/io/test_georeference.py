@@ -134,7 +134,7 @@ def test_a_local_system_of_context_capture_is_placed(tmp_path):
     (tmp_path / "metadata.xml").write_text(metadata("ENU:-38.75,143.66", "10,20,5"))
     utm = obj(tmp_path / "other" / "utm.obj", points + SHIFT)
     (tmp_path / "other" / "utm.prj").write_text(CRS)
-    from meshreg.io.frames import common_crs
+    from meshreg.io.frames.place import common_crs
 
     moving, _ = common_crs(read_survey(utm), read_survey(path))
     lat, lon = np.radians([-38.75, 143.66])
@@ -443,7 +443,7 @@ def test_a_geocentric_reference_makes_no_other_file_geocentric(tmp_path):
     earth = geocentric(flat)
     center = np.round(earth.mean(axis=0))
     reference = read_survey(glb(tmp_path / "reef.glb", y_up(earth - center), center))
-    from meshreg.io.frames import common_crs
+    from meshreg.io.frames.place import common_crs
 
     path = obj(tmp_path / "b" / "reef.obj")
     (path.parent / "SHIFT.txt").write_text(f"{CRS} 731000 5705000 0")
@@ -463,7 +463,7 @@ def test_maps_made_of_a_survey_are_in_its_local_crs(tmp_path, unit, carried):
 
     from meshreg.cli import app as cli
     from meshreg.io import ReadOptions
-    from meshreg.io.record import write_record_files
+    from meshreg.io.result.record import write_record_files
 
     path = obj(tmp_path / "in/reef.obj")
     axes = 'AXIS["E",EAST],AXIS["N",NORTH]'

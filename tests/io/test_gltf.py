@@ -20,9 +20,9 @@ from meshreg.errors import (
     UnsafeReferenceError,
     UsageError,
 )
-from meshreg.io.frames import make_mover
-from meshreg.io.gltf import read, rewrite, write
-from meshreg.io.images import open_texture_bytes, texture_from_array
+from meshreg.io.files.images import open_texture_bytes, texture_from_array
+from meshreg.io.frames.place import make_mover
+from meshreg.io.gltf.read import read, rewrite, write
 from meshreg.io.options import ReadOptions
 from meshreg.records import Frame, Grid, Maps, Mesh, PointCloud, Survey, Transform
 
@@ -922,7 +922,7 @@ def test_maps_are_not_written_and_a_full_disk_leaves_what_was_there(tmp_path, mo
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("meshreg.io.gltf_write._write_glb", full)
+    monkeypatch.setattr("meshreg.io.gltf.write._write_glb", full)
     with pytest.raises(OutputError, match="No space"):
         write(Survey("cloud", PointCloud(POINTS)), target)
     assert target.read_text() == "before"
@@ -930,7 +930,7 @@ def test_maps_are_not_written_and_a_full_disk_leaves_what_was_there(tmp_path, mo
 
 
 def test_a_copy_that_does_not_read_back_is_not_kept(tmp_path, monkeypatch):
-    from meshreg.io.gltf_parts import read_geometry
+    from meshreg.io.gltf.parts import read_geometry
 
     calls = []
 
@@ -939,7 +939,7 @@ def test_a_copy_that_does_not_read_back_is_not_kept(tmp_path, monkeypatch):
         return read_geometry(document) + (0.01 if len(calls) > 1 else 0.0)
 
     survey = read(made().glb(tmp_path / "a.glb"), ReadOptions())
-    monkeypatch.setattr("meshreg.io.gltf_rewrite.read_geometry", shifted)
+    monkeypatch.setattr("meshreg.io.gltf.rewrite.read_geometry", shifted)
     with pytest.raises(OutputError, match=r"does not read back.*off by up to 0.01"):
         rewrite(survey.source[0], mover(survey), tmp_path / "b.glb")
     assert [item.name for item in tmp_path.iterdir()] == ["a.glb"]

@@ -20,7 +20,9 @@ import rasterio
 from rasterio import Affine
 
 from meshreg.errors import InputError, ResourceLimitError
-from meshreg.io import cloud, decoding, read_survey, rewrite_survey, safe
+from meshreg.io import read_survey, rewrite_survey
+from meshreg.io.files import decoding, safe
+from meshreg.io.las import read as cloud
 from meshreg.records import Transform
 
 DATA = Path(__file__).parent.parent / "data" / "hostile"
@@ -98,7 +100,7 @@ def test_a_decoder_has_a_bound_on_its_memory(tmp_path, monkeypatch):
 def test_a_large_page_comes_the_same_from_a_process_of_its_own(tmp_path, monkeypatch, mode, inside):
     from PIL import Image
 
-    from meshreg.io import images
+    from meshreg.io.files import images
 
     rng = np.random.default_rng(5)
     depth = {"RGB": (3,), "RGBA": (4,)}.get(mode, ())
@@ -241,7 +243,7 @@ def test_a_crs_that_proj_cannot_work_with_is_refused(tmp_path):
 
 @pytest.mark.parametrize("ring", ["[]", "[[0, 0], [1e300, 0], [0, 1e300]]", "[[0, 0], [1, 1]]"])
 def test_a_mask_that_bounds_nothing_is_refused(tmp_path, ring):
-    from meshreg.io.masks import read_mask
+    from meshreg.io.masks.read import read_mask
 
     rings = "[]" if ring == "[]" else f"[{ring}]"
     path = tmp_path / "m.geojson"
@@ -363,7 +365,7 @@ def test_what_is_in_proportion_is_read(needed, n_bytes):
 
 
 def test_pages_of_few_bytes_are_not_decoded_all_at_once():
-    from meshreg.io.images import EncodedImage
+    from meshreg.io.files.images import EncodedImage
     from meshreg.raster.textures import plan_pages
     from meshreg.records import Mesh, Texture
 

@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 
 from meshreg.errors import InputError, OutputError, ResourceLimitError, UsageError
-from meshreg.io.images import (
+from meshreg.io.files.images import (
     EncodedImage,
     open_texture,
     open_texture_bytes,

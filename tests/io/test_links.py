@@ -11,7 +11,7 @@ import rasterio
 
 from meshreg.errors import InputError, UnsafeReferenceError
 from meshreg.io import read_survey
-from meshreg.io.sidecar import find_sidecar, is_sidecar
+from meshreg.io.frames.sidecar import find_sidecar, is_sidecar
 
 DATA = Path(__file__).parents[1] / "data"
 OBJ = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"

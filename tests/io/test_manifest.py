@@ -17,14 +17,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from meshreg.errors import UsageError
-from meshreg.io import atomic, folders, manifest
-from meshreg.io.folders import atomic_folder
-from meshreg.io.manifest import (
-    require_apart,
-    require_only_ours,
-    require_ours,
-    write_into,
-)
+from meshreg.io.files import atomic
+from meshreg.io.result import folders, manifest
+from meshreg.io.result.folders import atomic_folder
+from meshreg.io.result.manifest import require_apart, require_only_ours, require_ours, write_into
 
 
 def tree(folder: Path) -> dict[str, bytes]:
@@ -355,7 +351,7 @@ def test_a_run_killed_at_any_file_leaves_only_files_that_are_ours(
                 os.rename(source, to)
 
             with monkeypatch.context() as patch:
-                patch.setattr("meshreg.io.folders.os.replace", replace)
+                patch.setattr("meshreg.io.result.folders.os.replace", replace)
                 with pytest.raises(KeyboardInterrupt):
                     write_into(out, {name: data + bytes([at]) for name, data in files.items()})
             assert len(replaced) == at

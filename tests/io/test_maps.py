@@ -16,8 +16,10 @@ from scipy.ndimage import binary_erosion
 from scipy.spatial.transform import Rotation
 
 from meshreg.errors import InputError, OutputError, ResourceLimitError, UsageError
-from meshreg.io import geotiff, geotiff_write, maps, regrid
-from meshreg.io.mover import make_mover
+from meshreg.io.frames.mover import make_mover
+from meshreg.io.maps import geotiff, regrid
+from meshreg.io.maps import pair as maps
+from meshreg.io.maps import write as geotiff_write
 from meshreg.io.options import ReadOptions
 from meshreg.records import (
     Frame,

@@ -16,7 +16,8 @@ from matplotlib.path import Path as Outline
 from rasterio import Affine
 
 from meshreg.errors import InputError
-from meshreg.io import mask_polygons, masks
+from meshreg.io.masks import files as mask_polygons
+from meshreg.io.masks import read as masks
 from meshreg.records import Frame, Grid, PointCloud, SourceFile, Survey
 
 CRS = "EPSG:32754"

@@ -14,7 +14,7 @@ from PIL import Image
 
 from meshreg.errors import InputError
 from meshreg.io import read_survey, require_writable, rewrite_survey
-from meshreg.io.naming import planned
+from meshreg.io.files.naming import planned
 from meshreg.records import SourceFile, Survey, Transform
 
 COLOURS = [(250, 10, 20), (30, 240, 50), (60, 70, 230)]
@@ -211,7 +211,7 @@ def glb(path, extent, crs):
 
 
 def test_a_gltf_that_a_change_of_crs_would_bend_is_refused_before_the_work(tmp_path):
-    from meshreg.io.frames import common_crs
+    from meshreg.io.frames.place import common_crs
 
     near = read_survey(glb(tmp_path / "near.glb", 100.0, "EPSG:32754"))
     far = read_survey(glb(tmp_path / "far.glb", 20_000.0, "EPSG:32754"))

@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from meshreg.errors import InputError, ResourceLimitError, UnsafeReferenceError
-from meshreg.io import line_blocks
-from meshreg.io.obj import read
-from meshreg.io.obj_scan import scan
+from meshreg.io.files import line_blocks
+from meshreg.io.obj.read import read
+from meshreg.io.obj.scan import scan
 from meshreg.io.options import ReadOptions
 from meshreg.records import Mesh, PointCloud
 

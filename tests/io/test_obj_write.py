@@ -14,10 +14,12 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from meshreg.errors import InputError, OutputError, UsageError
-from meshreg.io import line_blocks, obj_write, obj_write_kernels
-from meshreg.io.images import open_texture, texture_from_array
-from meshreg.io.mover import make_mover
-from meshreg.io.obj import read, rewrite, write
+from meshreg.io.files import line_blocks
+from meshreg.io.files.images import open_texture, texture_from_array
+from meshreg.io.frames.mover import make_mover
+from meshreg.io.obj import write as obj_write
+from meshreg.io.obj import write_kernels as obj_write_kernels
+from meshreg.io.obj.read import read, rewrite, write
 from meshreg.io.options import ReadOptions
 from meshreg.records import Frame, Grid, Maps, Mesh, PointCloud, Survey, Transform
 
@@ -203,7 +205,7 @@ def test_a_missing_folder_is_an_output_error(tmp_path):
 @example(-0.0000001, 6)
 @example(999999.9999999, 3)
 def test_numbers_are_written_to_the_last_decimal(value, decimals):
-    from meshreg.io.obj_write_kernels import MAX_NUMBER, put_rows
+    from meshreg.io.obj.write_kernels import MAX_NUMBER, put_rows
 
     out = np.zeros(100, np.uint8)
     word, none = np.frombuffer(b"v", np.uint8), np.empty((0, 3))

@@ -14,9 +14,9 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from meshreg.errors import InputError, UnsafeReferenceError, UsageError
-from meshreg.io.frames import make_mover
+from meshreg.io.frames.place import make_mover
 from meshreg.io.options import ReadOptions
-from meshreg.io.ply import read, rewrite, write
+from meshreg.io.ply.read import read, rewrite, write
 from meshreg.records import Frame, Maps, Mesh, PointCloud, Survey, Transform
 
 XYZ = [("x", "double"), ("y", "double"), ("z", "double")]
@@ -110,8 +110,8 @@ def test_any_types_orders_and_elements(tmp_path_factory, elements, order, newlin
 @settings(max_examples=60, deadline=None)
 def test_faces_equal_the_slow_decoder(tmp_path_factory, elements, order):
     """Before any cleaning: the columns as they are in the file."""
-    from meshreg.io.ply_body import read_tables
-    from meshreg.io.ply_header import read_header
+    from meshreg.io.ply.body import read_tables
+    from meshreg.io.ply.header import read_header
 
     path = ply(tmp_path_factory.mktemp("ply") / "a.ply", elements, order=order)
     header = read_header(path)
@@ -827,7 +827,7 @@ def test_classes_of_noise_and_water_are_left_out_of_a_cloud(tmp_path):
 @given(st.integers(0, 2**32 - 1), st.booleans(), st.integers(0, 3))
 @settings(max_examples=25, deadline=None)
 def test_what_is_written_reads_back_the_same(tmp_path_factory, seed, colored, n_pages):
-    from meshreg.io.images import texture_from_array
+    from meshreg.io.files.images import texture_from_array
 
     rng = np.random.default_rng(seed)
     folder = tmp_path_factory.mktemp("ply")
@@ -876,12 +876,12 @@ def test_full_disk_leaves_what_was_there(tmp_path, monkeypatch):
     target = tmp_path / "b.ply"
     target.write_text("before")
     survey = read(ply(tmp_path / "a.ply", mesh_elements()), ReadOptions())
-    monkeypatch.setattr("meshreg.io.ply_write._CHUNK", 2)
+    monkeypatch.setattr("meshreg.io.ply.write._CHUNK", 2)
 
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("meshreg.io.ply_write._copy", full)
+    monkeypatch.setattr("meshreg.io.ply.write._copy", full)
     with pytest.raises(OutputError, match="No space left"):
         rewrite(survey.source[0], mover(survey), target)
     assert target.read_text() == "before"
@@ -919,14 +919,14 @@ def test_a_copy_that_does_not_read_back_is_not_kept(tmp_path, monkeypatch, order
     from meshreg.errors import OutputError
 
     survey = read(ply(tmp_path / "a.ply", mesh_elements(), order=order), ReadOptions())
-    monkeypatch.setattr("meshreg.io.ply_write.scalar_columns", _shifted_on_second_reading())
+    monkeypatch.setattr("meshreg.io.ply.write.scalar_columns", _shifted_on_second_reading())
     with pytest.raises(OutputError, match="does not read back"):
         rewrite(survey.source[0], mover(survey), tmp_path / "b.ply")
     assert [item.name for item in tmp_path.iterdir()] == ["a.ply"]
 
 
 def _shifted_on_second_reading():
-    from meshreg.io.ply_body import scalar_columns
+    from meshreg.io.ply.body import scalar_columns
 
     calls = []
 

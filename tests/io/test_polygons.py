@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 from meshreg.errors import InputError
 from meshreg.io.assemble import eight_bit_colors
-from meshreg.io.numbers_kernels import parse_number
-from meshreg.io.polygons import triangulate, usable_faces, weld
+from meshreg.io.files.numbers_kernels import parse_number
+from meshreg.io.masks.polygons import triangulate, usable_faces, weld
 
 
 def star(radii, turn=(0, 1, 2), at=(0.0, 0.0, 0.0)):

@@ -18,10 +18,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from meshreg.errors import InputError, OutputError, UnsafeReferenceError, UsageError
-from meshreg.io import atomic
-from meshreg.io.atomic import atomic_file, copy_file
-from meshreg.io.folders import atomic_folder
-from meshreg.io.safe import (
+from meshreg.io.files import atomic
+from meshreg.io.files.atomic import atomic_file, copy_file
+from meshreg.io.files.safe import (
     MissingReferenceError,
     decode_name,
     file_bytes,
@@ -31,6 +30,7 @@ from meshreg.io.safe import (
     resolve_reference,
     sha256,
 )
+from meshreg.io.result.folders import atomic_folder
 
 
 @pytest.fixture

@@ -10,9 +10,10 @@ import pytest
 import reference_ply as twin
 
 from meshreg.errors import OutputError
-from meshreg.io import obj_write, read_survey, rewrite_survey, second_reader, write_survey
-from meshreg.io.cloud_write import _LOST
-from meshreg.io.mover import make_mover
+from meshreg.io import read_survey, rewrite_survey, second_reader, write_survey
+from meshreg.io.frames.mover import make_mover
+from meshreg.io.las.write import _LOST
+from meshreg.io.obj import write as obj_write
 from meshreg.records import Mesh, PointCloud, Survey, Transform
 
 C, S = math.cos(0.4), math.sin(0.4)
@@ -139,7 +140,7 @@ def test_nodes_of_a_glb(tmp_path):
 
 
 def test_laszip_agrees_with_lazrs(tmp_path, monkeypatch):
-    from meshreg.io import cloud_write
+    from meshreg.io.las import write as cloud_write
 
     if not laspy.LazBackend.Laszip.is_available():
         pytest.skip("laszip is not there")

@@ -9,10 +9,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from meshreg.errors import InputError, OutputError
-from meshreg.io.axes import NED, Y_UP
-from meshreg.io.frames import frame_from
+from meshreg.io.frames.axes import NED, Y_UP
+from meshreg.io.frames.place import frame_from
+from meshreg.io.frames.sidecar import SidecarInfo, find_sidecar, is_sidecar, write_shift
 from meshreg.io.options import ReadOptions
-from meshreg.io.sidecar import SidecarInfo, find_sidecar, is_sidecar, write_shift
 from meshreg.records import Frame
 
 CENTRE = (500.0, 400.0, 3.0)  # file coordinates; with the shift they lie in zone 54 south

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from meshreg.errors import InputError, UsageError
-from meshreg.io import off, stl
-from meshreg.io.frames import make_mover
+from meshreg.io.frames.place import make_mover
 from meshreg.io.options import ReadOptions
+from meshreg.io.other import off, stl
 from meshreg.records import Mesh, PointCloud, Survey, Transform
 
 POINTS = np.array([[0, 0, 0.5], [4, 0, 0.25], [4, 3, 0], [0, 3, 1.0]])

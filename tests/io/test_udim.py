@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from meshreg.io import read_survey, rewrite_survey
-from meshreg.io.udim import first_tile, has_token, tile_pages
+from meshreg.io.obj.udim import first_tile, has_token, tile_pages
 from meshreg.raster import rasterize
 from meshreg.records import Grid, Transform
 

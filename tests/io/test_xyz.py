@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from meshreg.errors import InputError, MeshregError, OutputError
 from meshreg.io import read_survey, rewrite_survey, write_survey
-from meshreg.io.xyz_kernels import count_rows, parse_rows, splice_rows
+from meshreg.io.text.kernels import count_rows, parse_rows, splice_rows
 from meshreg.records import Frame, PointCloud, SourceFile, Survey, Transform
 from tests.reference_io import fields_of, rows_of, spliced, utm
 
@@ -611,7 +611,7 @@ def test_degrees_stay_degrees_without_a_reference(tmp_path):
 
 
 def test_a_failed_rewrite_leaves_nothing(tmp_path, monkeypatch):
-    from meshreg.io import xyz_write
+    from meshreg.io.text import write as xyz_write
 
     survey = read_survey(text(tmp_path / "a.xyz", "1 2 3\n4 5 6\n"))
 

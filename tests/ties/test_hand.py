@@ -17,8 +17,8 @@ from made_registration import EAST, NORTH, made_registration
 
 from meshreg.cli import app as cli
 from meshreg.errors import InputError
-from meshreg.io import document as document_module
-from meshreg.io.document import read_registration, registration_document, to_json
+from meshreg.io.result import document as document_module
+from meshreg.io.result.document import read_registration, registration_document, to_json
 from meshreg.judge.verdict import findings
 from meshreg.pipeline import decision
 from meshreg.records import OffsetEstimate, Transform

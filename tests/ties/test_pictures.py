@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from meshreg.io.geotiff_write import write_height
+from meshreg.io.maps.write import write_height
 from meshreg.records import Grid, Maps, PointCloud, Survey
 from meshreg.settings import RasterSettings
 from meshreg.ties import server

@@ -14,7 +14,7 @@ from meshreg.cli.common import SurveyRequest
 from meshreg.cli.console import Voice
 from meshreg.cli.picking import PickRequest, _desk
 from meshreg.io.options import ReadOptions
-from meshreg.io.record import write_registration
+from meshreg.io.result.record import write_registration
 from meshreg.ties.placing import read_placing
 
 

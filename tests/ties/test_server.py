@@ -22,8 +22,8 @@ from starlette.testclient import TestClient
 
 from meshreg.cli import app as cli
 from meshreg.errors import InputError, OutputError, UsageError
-from meshreg.io.document import registration_document, to_json
-from meshreg.io.maps import write_raster
+from meshreg.io.maps.pair import write_raster
+from meshreg.io.result.document import registration_document, to_json
 from meshreg.records import Grid, SurveyRaster
 from meshreg.ties import TiePair, TiePoints, read_ties, write_ties
 from meshreg.ties.desk import Desk, Link

@@ -1,0 +1,1 @@
+"""Files opened, decoded, named and written safely, whatever their format."""
