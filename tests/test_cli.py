@@ -36,7 +36,9 @@ from meshreg.records import Grid, Maps, Mesh, PointCloud, Survey, Transform
 from meshreg.settings import Settings
 
 ROOT = Path(__file__).parent.parent
-SCHEMA = json.loads((Path(meshreg.__file__).parent / "io/registration.schema.json").read_text())
+SCHEMA = json.loads(
+    (Path(meshreg.__file__).parent / "io/result/registration.schema.json").read_text()
+)
 Run = Callable[..., tuple[int, str, str]]
 
 

@@ -20,7 +20,9 @@ import meshreg
 from meshreg.cli import console, demonstrating
 
 ROOT = Path(__file__).parent.parent
-SCHEMA = json.loads((Path(meshreg.__file__).parent / "io/registration.schema.json").read_text())
+SCHEMA = json.loads(
+    (Path(meshreg.__file__).parent / "io/result/registration.schema.json").read_text()
+)
 
 
 @pytest.fixture(scope="module")

@@ -24,7 +24,7 @@ from meshreg.io.result.record import matrix_text, read_registration, write_regis
 from meshreg.records import Frame, Mesh, PointCloud, Registration, SourceFile, Survey
 from meshreg.settings import Settings, read_settings
 
-SCHEMA_FILE = Path(meshreg.__file__).parent / "io" / "registration.schema.json"
+SCHEMA_FILE = Path(meshreg.__file__).parent / "io" / "result" / "registration.schema.json"
 VERDICTS = ("accepted", "review", "rejected")
 
 

@@ -694,7 +694,9 @@ def test_the_schema_takes_it():
     jsonschema = pytest.importorskip("jsonschema")
     registration, _ = warped_registration()
     schema = json.loads(
-        (Path(meshreg.__file__).parent / "io" / "registration.schema.json").read_text("utf-8")
+        (Path(meshreg.__file__).parent / "io" / "result" / "registration.schema.json").read_text(
+            "utf-8"
+        )
     )
     document = registration_document(registration)
     jsonschema.validate(document, schema)

@@ -20,6 +20,7 @@ from meshreg.heading.turned import (
     yaw_of,
 )
 from meshreg.heading.voting import (
+    PLAIN_RATIO,
     PLAIN_SCALE,
     SMALL_YAW,
     STANDS_OUT,
@@ -30,6 +31,7 @@ from meshreg.heading.voting import (
 )
 
 __all__ = [
+    "PLAIN_RATIO",
     "PLAIN_SCALE",
     "SMALL_YAW",
     "STANDS_OUT",

@@ -15,6 +15,7 @@ import numpy as np
 
 from meshreg import judge as judging
 from meshreg.heading import (
+    PLAIN_RATIO,
     PLAIN_SCALE,
     STANDS_OUT,
     Pairs,
@@ -213,14 +214,24 @@ def _turned_if_voted(
         better = decision.judgement.false_alarm < delivered.judgement.false_alarm
         return decision if better or not known else delivered
     # the finer tiles may contradict the turn or the scale, if few of the coarse ones told it
-    unneeded = turn.scale != 1.0 and abs(decision.scale - 1) < PLAIN_SCALE
-    unneeded = unneeded and not settings.search.free_scale
-    if decision.judgement.verdict != "accepted" and (decision.found.turned or unneeded):
+    scaled = decision.scale != 1.0 and not settings.search.free_scale
+    if decision.judgement.verdict != "accepted" and (decision.found.turned or scaled):
         delivered = in_frame(pairs, settings, radius, clock, manual, None)
-        return delivered if delivered.judgement.verdict == "accepted" else decision
+        accepted = delivered.judgement.verdict == "accepted"
+        return delivered if accepted and not (scaled and _plain(delivered)) else decision
     if decision.judgement.verdict != "rejected":
         return decision
     return in_frame(pairs, settings, radius, clock, manual, turn)
+
+
+def _plain(decision: Decision) -> bool:
+    """Whether the finest tiles show a scale that is plainly wrong, as a vote would say it."""
+    stretch = decision.found.stretch
+    return (
+        stretch is not None
+        and abs(stretch.value - 1) >= PLAIN_SCALE
+        and stretch.ratio >= PLAIN_RATIO
+    )
 
 
 def _narrowed(

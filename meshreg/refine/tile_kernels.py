@@ -27,7 +27,7 @@ def polish(
     Parameters
     ----------
     still, moved : (5, H, W) float64
-        Layers of a `meshreg.tiles.Relief`.
+        Layers of a `refine.tiles.Relief`.
     places : (N, 4) float64
         Row and column in `moved`, and the bent place [m east, m north], of the cells of all tiles.
     bounds : (M + 1,) int64

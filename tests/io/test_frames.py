@@ -320,7 +320,7 @@ def test_a_wrong_proj_data_is_forgotten_with_a_note(monkeypatch, tmp_path):
 
 def test_a_wrong_proj_data_does_not_stop_a_change_of_crs(tmp_path):
     code = (
-        "from meshreg.io.bridge import bridge; "
+        "from meshreg.io.frames.bridge import bridge; "
         "print(*bridge('EPSG:32754', 'EPSG:4326').forward([[731500, 5705400, 3]])[0])"
     )
     env = {**os.environ, "PROJ_DATA": str(tmp_path), "PROJ_LIB": str(tmp_path)}

@@ -22,7 +22,9 @@ from meshreg.errors import (
 )
 from meshreg.io.files.images import open_texture_bytes, texture_from_array
 from meshreg.io.frames.place import make_mover
-from meshreg.io.gltf.read import read, rewrite, write
+from meshreg.io.gltf.read import read
+from meshreg.io.gltf.rewrite import rewrite
+from meshreg.io.gltf.write import write
 from meshreg.io.options import ReadOptions
 from meshreg.records import Frame, Grid, Maps, Mesh, PointCloud, Survey, Transform
 

@@ -144,7 +144,7 @@ def test_a_file_that_loses_its_end_later_does_not_end_the_process(tmp_path):
     path = tmp_path / "a.bin"
     path.write_bytes(b"\1" * 1_000_000)
     program = (
-        "import os, sys; from pathlib import Path; from meshreg.io.safe import file_bytes\n"
+        "import os, sys; from pathlib import Path; from meshreg.io.files.safe import file_bytes\n"
         "data = file_bytes(Path(sys.argv[1])); os.truncate(sys.argv[1], 0); print(data.sum())"
     )
     done = subprocess.run(
@@ -401,7 +401,7 @@ import sys
 from pathlib import Path
 import numpy as np
 from meshreg.io import read_survey, rewrite_survey
-from meshreg.types import Transform
+from meshreg.records import Transform
 
 cos, sin = np.cos(0.02), np.sin(0.02)
 turn = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])

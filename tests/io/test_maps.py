@@ -817,8 +817,8 @@ import subprocess
 import sys
 from pathlib import Path
 from meshreg.errors import OutputError
-from meshreg.io.geotiff_write import write_height
-from meshreg.types import Grid
+from meshreg.io.maps.write import write_height
+from meshreg.records import Grid
 
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 folder = Path(sys.argv[1])

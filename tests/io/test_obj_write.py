@@ -19,7 +19,8 @@ from meshreg.io.files.images import open_texture, texture_from_array
 from meshreg.io.frames.mover import make_mover
 from meshreg.io.obj import write as obj_write
 from meshreg.io.obj import write_kernels as obj_write_kernels
-from meshreg.io.obj.read import read, rewrite, write
+from meshreg.io.obj.read import read
+from meshreg.io.obj.write import rewrite, write
 from meshreg.io.options import ReadOptions
 from meshreg.records import Frame, Grid, Maps, Mesh, PointCloud, Survey, Transform
 

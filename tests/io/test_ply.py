@@ -16,7 +16,8 @@ from scipy.spatial.transform import Rotation
 from meshreg.errors import InputError, UnsafeReferenceError, UsageError
 from meshreg.io.frames.place import make_mover
 from meshreg.io.options import ReadOptions
-from meshreg.io.ply.read import read, rewrite, write
+from meshreg.io.ply.read import read
+from meshreg.io.ply.write import rewrite, write
 from meshreg.records import Frame, Maps, Mesh, PointCloud, Survey, Transform
 
 XYZ = [("x", "double"), ("y", "double"), ("z", "double")]

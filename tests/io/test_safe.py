@@ -374,7 +374,7 @@ def test_atomic_file_clears_away_what_a_killed_process_left(tmp_path):
     path = tmp_path / "out.json"
     code = (
         "import os, signal, sys\n"
-        "from meshreg.io.atomic import atomic_file\n"
+        "from meshreg.io.files.atomic import atomic_file\n"
         "with atomic_file(sys.argv[1]) as temporary:\n"
         "    temporary.write_text('half')\n"
         "    os.kill(os.getpid(), signal.SIGKILL)\n"

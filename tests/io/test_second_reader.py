@@ -165,7 +165,14 @@ def test_every_format_is_looked_at_by_a_second_reader(tmp_path, suffix, monkeypa
     path = write_survey(survey, tmp_path / f"a{suffix}")[0]
     names = [name for name in dir(second_reader) if name.startswith("require_")]
     called = []
-    for module in ("obj_write", "ply_write", "stl", "gltf_rewrite", "xyz_write", "cloud_write"):
+    for module in (
+        "obj.write",
+        "ply.write",
+        "other.stl",
+        "gltf.rewrite",
+        "text.write",
+        "las.write",
+    ):
         loaded = __import__(f"meshreg.io.{module}", fromlist=["x"])
         for name in names:
             if hasattr(loaded, name):

@@ -534,7 +534,7 @@ def test_nothing_stays_behind_a_pick_that_is_killed(tmp_path):
     (left / "picture.tif").write_text("")
     code = (
         "import os, signal, sys\n"
-        "from meshreg.cli_parts.picking import _removed_in_any_case\n"
+        "from meshreg.cli.picking import _removed_in_any_case\n"
         "with _removed_in_any_case(sys.argv[1]):\n"
         "    os.kill(os.getpid(), signal.SIGKILL)\n"
     )
