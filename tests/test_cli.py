@@ -95,8 +95,8 @@ def verdict(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], dict[str, Any]]:
             return dataclasses.replace(
                 made_registration(name),
                 settings=settings.as_dict(),
-                reference=meshreg.pipeline.register._about(reference),
-                moving=meshreg.pipeline.register._about(moving),
+                reference=meshreg.pipeline.recording._about(reference),
+                moving=meshreg.pipeline.recording._about(moving),
             )
 
         monkeypatch.setattr(meshreg.pipeline, "register_pair", register_pair)

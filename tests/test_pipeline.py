@@ -122,7 +122,7 @@ def test_the_tilt_that_counts_is_that_after_the_surfaces(monkeypatch, degrees, c
         turned = rotation([np.deg2rad(degrees), 0.0]) @ transform.rotation
         return Polished(dataclasses.replace(transform, rotation=turned), True, 0.0, 0.1, 0.1, "x")
 
-    monkeypatch.setattr("meshreg.pipeline.register.polish", tilted)
+    monkeypatch.setattr("meshreg.pipeline.answer.polish", tilted)
     pair = survey(first, half=2.5, step=0.05, seed=1), displaced(survey(later, half=2.5, step=0.05))
     found = register_pair(pair[0], pair[1][0], QUICK.changed({"refine.surfaces": "gicp"}))
     assert [finding.code for finding in found.findings] == codes

@@ -215,7 +215,7 @@ def test_axes_that_bounds_cannot_tell_are_told_by_image_and_relief(axes, name, r
     )
     found = register_pair(reference, wrong, QUICK)
     assert found.verdict != "accepted"
-    said = next(finding.said for finding in found.findings if finding.code == "axes")
+    said = next(finding.text for finding in found.findings if finding.code == "axes")
     assert f"would agree if the moving survey were read with {name} in" in said
 
 

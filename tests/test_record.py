@@ -168,8 +168,8 @@ def change(document: dict[str, Any], place: str, value: Any) -> None:
 @pytest.mark.parametrize(
     ("place", "value", "message"),
     [
-        ("schema", "meshreg.registration/2", "newer"),
-        ("schema", "odm.alignment/1", "meshreg.registration/1"),
+        ("schema", "meshreg.registration/3", "newer"),
+        ("schema", "odm.alignment/1", "meshreg.registration/2"),
         ("schema", KeyError, "has schema None"),
         ("verdict", "fine", "verdict"),
         ("verdict", "rejected", "offset: is .*; it must be null"),

@@ -206,7 +206,7 @@ def test_half_a_model_that_slid_is_reviewed():
     found = register_pair(reference, displaced(torn)[0], QUICK)
     assert found.verdict != "accepted"
     tear = next(finding for finding in found.findings if finding.code == "tear")
-    assert "torn, or slid" in tear.said
+    assert "torn, or slid" in tear.text
     assert "torn, or slid" in found.reason
 
 
@@ -270,7 +270,7 @@ PLACED = Judgement("accepted", "terrain and image agree", None)
         (Found(stretch=Stretch(1.0199, 0.001, 5.7, 7.0)), "scale"),
         (Found(stretch=Stretch(0.99, 0.001, 2.8, 2.0)), "scale"),
         (Found(gain=Gain(3.28, 0.02, True)), "heights"),
-        (Found(gain=Gain(inverted=True)), "heights"),
+        (Found(gain=Gain(inverted=True)), "upside_down"),
         (Found(tilt=12.0), "lean"),
         (Found(dips=(80.0, 81.0)), "upright"),
         (Found(dips=(4.0, 81.0)), "lean"),
@@ -285,7 +285,7 @@ def test_each_finding_reaches_the_verdict(found, code):
     assert [finding.code for finding in against] == [code]
     judged = last_word(PLACED, against)
     assert judged.verdict == "review"
-    assert against[0].said in judged.reason
+    assert against[0].text in judged.reason
     rejected = dataclasses.replace(PLACED, verdict="rejected")
     assert last_word(rejected, against).verdict == "rejected"
 

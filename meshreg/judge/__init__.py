@@ -20,6 +20,7 @@ from meshreg.judge.layers import (
     second_surface,
 )
 from meshreg.judge.verdict import (
+    CODES,
     Found,
     Stretch,
     findings,
@@ -27,6 +28,7 @@ from meshreg.judge.verdict import (
 )
 
 __all__ = [
+    "CODES",
     "EXCHANGED",
     "SCORED_OVERLAP",
     "ChannelMap",

@@ -19,7 +19,7 @@ from meshreg.offsets import neutral
 from meshreg.offsets.channels import smooth
 from meshreg.offsets.correlate import Correlator, Window
 from meshreg.offsets.surface import Peak, find_peak, gap_at
-from meshreg.records import Float64, OffsetEstimate, SurveyRaster, Verdict
+from meshreg.records import Finding, Float64, OffsetEstimate, Severity, SurveyRaster, Verdict
 from meshreg.settings import JudgeSettings, Settings
 
 EXCHANGES = ((True, False), (False, True), (True, True))  # down, across
@@ -101,7 +101,10 @@ class Hypothesis:
 
 @dataclass(frozen=True)
 class Judgement:
-    """The verdict before refinement."""
+    """The verdict, and what speaks against accepting the pair.
+
+    The reason is the text of the findings; of an accepted pair, what speaks for it.
+    """
 
     verdict: Verdict
     reason: str
@@ -109,13 +112,20 @@ class Judgement:
     hypotheses: tuple[Hypothesis, ...] = ()
     false_alarm: float = 1.0
     maps: Mapping[str, ChannelMap] = field(default_factory=dict)
+    findings: tuple[Finding, ...] = ()
 
-    def doubted(self, reason: str) -> Judgement:
-        """Return the same judgement, no better than "review" where there is a reason to doubt."""
-        if not reason:
+    def downgraded(self, against: Sequence[Finding]) -> Judgement:
+        """Return the same judgement, no better than "review" where anything speaks against."""
+        if not against:
             return self
         verdict: Verdict = "review" if self.verdict == "accepted" else self.verdict
-        return replace(self, verdict=verdict, reason=f"{reason} ({self.reason})")
+        reason = "; ".join(finding.text for finding in against)
+        return replace(
+            self,
+            verdict=verdict,
+            reason=f"{reason} ({self.reason})",
+            findings=(*against, *self.findings),
+        )
 
 
 def channel_maps(
@@ -177,14 +187,16 @@ def judge(
     if maps is None:
         maps = channel_maps(rasters, radius)
     if not maps:
-        return Judgement("rejected", "the surveys do not overlap within the search window", None)
+        said = "the surveys do not overlap within the search window"
+        return Judgement("rejected", said, None, findings=(Finding("nothing", said, "rejected"),))
     reach = agree_distance(settings.judge, rasters["dem"])
     candidates = _candidates(estimates, maps)
     hypotheses = tuple(
         sorted(_merge(candidates, maps, reach, rivals or {}), key=lambda h: h.score, reverse=True)
     )
     if not hypotheses:
-        return Judgement("rejected", "no method found a candidate", None, maps=maps)
+        none = Finding("nothing", "no method found a candidate", "rejected")
+        return Judgement("rejected", none.text, None, maps=maps, findings=(none,))
     reliefs = [relief_of(raster) for raster in rasters["dem"]]
     flat = _flat(reliefs, settings.judge.flat_relief)
     return _verdict(hypotheses, maps, settings.judge, radius, reach, trials, flat)
@@ -398,8 +410,15 @@ def _verdict(
     best = hypotheses[0]
     alarm = min(1.0, trials * _false_alarm(best, maps, radius, reach))
 
-    def say(verdict: Verdict, reason: str) -> Judgement:
-        return Judgement(verdict, reason, best, hypotheses, alarm, maps)
+    def accept(reason: str) -> Judgement:
+        return Judgement("accepted", reason, best, hypotheses, alarm, maps)
+
+    def say(severity: Severity, code: str, text: str) -> Judgement:
+        values = {f"{name}_gap": gap for name, gap in best.gaps.items()}
+        values |= {"false_alarm": alarm, "overlap": best.overlap}
+        values = {name: value for name, value in values.items() if math.isfinite(value)}
+        against = (Finding(code, text, severity, values),)
+        return Judgement(severity, text, best, hypotheses, alarm, maps, against)
 
     support = {name: gap for name, gap in best.gaps.items() if gap >= settings.support_gap}
     leader = max(best.gaps, key=lambda name: best.gaps[name])
@@ -414,41 +433,43 @@ def _verdict(
     how = turned if turned.startswith("with") else f"when {turned}"
     words = ", ".join(f"{name} gap {gap:.1f}" for name, gap in best.gaps.items())
     if turned and max(best.gaps.values()) < settings.accept_gap:
-        return say("rejected", f"the moving survey fits only {how}: check its axes")
+        return say("rejected", "mirrored", f"the moving survey fits only {how}: check its axes")
     if contradicting:
         where = " and ".join(contradicting)
-        return say(
-            "review", f"the channels contradict each other: {where} fits elsewhere ({words})"
-        )
+        said = f"the channels contradict each other: {where} fits elsewhere ({words})"
+        return say("review", "contradiction", said)
     if alarm > settings.chance_false_alarm and flat:
         return say(
             "review",
+            "flat",
             f"{flat}: too little to know the place by, or to tell it from another ({words})",
         )
     if alarm > settings.chance_false_alarm:
         return say(
             "rejected",
+            "chance",
             f"no offset within ±{radius:g} m stands out from chance ({words}); "
             "another place, too much change, or beyond the search radius",
         )
     if best.overlap < settings.min_overlap:
-        return say("review", f"the surveys overlap by only {best.overlap:.0%}")
+        return say("review", "overlap", f"the surveys overlap by only {best.overlap:.0%}")
     edge = radius - max(abs(best.east), abs(best.north))
     if edge < 2 * max(channel.window.cell for channel in maps.values()):
-        return say(
-            "review", "the best offset is at the search border; try a larger --search-radius"
-        )
+        said = "the best offset is at the search border; try a larger --search-radius"
+        return say("review", "border", said)
     if turned:
-        return say("review", f"the moving survey fits just as well {how}")
+        return say("review", "mirrored", f"the moving survey fits just as well {how}")
     if alarm > settings.max_false_alarm:
-        return say("review", f"chance could do as well once in {1 / alarm:.3g} ({words})")
+        said = f"chance could do as well once in {1 / alarm:.3g} ({words})"
+        return say("review", "weak", said)
     if len(support) >= 2 and max(support.values()) >= settings.accept_gap / 2:
-        return say("accepted", f"terrain and image agree ({words})")
+        return accept(f"terrain and image agree ({words})")
     if best.gaps[leader] >= settings.overwhelming_gap:
         others = [name for name in best.gaps if name != leader]
         silent = f"; {others[0]} is silent" if others else f"; there is no {_missing(maps)}"
-        return say("accepted", f"{leader} is overwhelming ({words}){silent}")
-    return say("review", f"only {leader} stands out, and not overwhelmingly ({words})")
+        return accept(f"{leader} is overwhelming ({words}){silent}")
+    said = f"only {leader} stands out, and not overwhelmingly ({words})"
+    return say("review", "alone", said)
 
 
 def _false_alarm(

@@ -8,7 +8,7 @@ anything better than it was.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -59,7 +59,7 @@ class Found:
 
     Attributes
     ----------
-    turned : str
+    turned : Finding or None
         Why the tiles give no answer of their own (`meshreg.refine`).
     tilted : str
         Why the heights give none (`height`).
@@ -73,7 +73,7 @@ class Found:
         Tilt of each survey's own surface [degrees].
     axes : str
         Which axes would make the surveys agree, where they do not and others were tried.
-    far : str
+    far : Finding or None
         At which turn or scale, beyond those that are searched, the surveys would fit.
     tilt : float
         Applied [degrees].
@@ -90,7 +90,7 @@ class Found:
         In what hand-picked points contradict the answer.
     """
 
-    turned: str = ""
+    turned: Finding | None = None
     tilted: str = ""
     scaled: str = ""
     stretch: Stretch | None = None
@@ -99,7 +99,7 @@ class Found:
     step: Tear | None = None
     dips: tuple[float, float] | None = None
     axes: str = ""
-    far: str = ""
+    far: Finding | None = None
     tilt: float = 0.0
     layers: tuple[Layer | None, Layer | None] = (None, None)
     sigma_up: float = 0.0
@@ -131,14 +131,18 @@ def _lean(found: Found) -> str:
     return ""
 
 
+def _upside_down(found: Found) -> str:
+    if found.gain is None or not found.gain.inverted:
+        return ""
+    return (
+        "the relief recurs upside down, as where one survey's heights are depths: what rises "
+        "in one falls in the other"
+    )
+
+
 def _heights(found: Found) -> str:
     gain = found.gain
-    if gain is not None and gain.inverted:
-        return (
-            "the relief recurs upside down, as where one survey's heights are depths: what rises "
-            "in one falls in the other"
-        )
-    if gain is None or not gain.departs:
+    if gain is None or gain.inverted or not gain.departs:
         return ""
     value = gain.value
     times = value if value > 1 else 1 / value
@@ -212,19 +216,21 @@ def _undecided(found: Found) -> str:
     )
 
 
-Rule = Callable[[Found], str]
-# In the order in which they are told: what explains other findings comes first.
+Rule = Callable[[Found], str | Finding | None]
+# In the order in which they are told: what explains other findings comes first. A rule gives the
+# text of a finding with its code, or a finding.
 RULES: tuple[tuple[str, Rule], ...] = (
     ("axes", lambda found: found.axes),
-    ("far", lambda found: found.far),
+    ("", lambda found: found.far),
     ("upright", _upright),
     ("lean", _lean),
     ("layers", _layered),
     ("tear", _torn),
+    ("upside_down", _upside_down),
     ("heights", _heights),
     ("scale", lambda found: found.scaled or _stretched(found)),
     ("tilt", lambda found: found.tilted),
-    ("yaw", lambda found: found.turned),
+    ("", lambda found: found.turned),
     ("light", _undecided),
     ("surfaces", lambda found: found.surfaces),
     ("up", _uncertain_up),
@@ -232,22 +238,77 @@ RULES: tuple[tuple[str, Rule], ...] = (
 )
 
 
+# The numbers of a finding, by its code.
+VALUES: Mapping[str, Callable[[Found], Mapping[str, float]]] = {
+    "upright": lambda found: _numbers(reference=_dip(found, 0), moving=_dip(found, 1)),
+    "lean": lambda found: _numbers(tilt_degrees=found.tilt),
+    "tear": lambda found: _numbers(horizontal=_size(found.tear), vertical=_size(found.step)),
+    "heights": lambda found: (
+        _numbers(gain=found.gain.value, sigma_log=found.gain.sigma) if found.gain else {}
+    ),
+    "scale": lambda found: (
+        _numbers(scale=part.value, sigma=part.sigma, moves=part.moves)
+        if (part := found.stretch)
+        else {}
+    ),
+    "light": lambda found: _numbers(cells=found.undecided),
+    "up": lambda found: _numbers(sigma_up=found.sigma_up, relief=found.relief),
+}
+# Codes of findings that are not made by the rules above.
+PLACED = ("mirrored", "contradiction", "flat", "chance", "overlap", "border", "weak", "alone")
+BEFORE = ("degrees", "apart", "nothing", "turned", "resized", "heading", "pieces")
+CODES = (*BEFORE, *(code for code, _ in RULES if code), *PLACED)
+FAR = ("turned", "resized")
 # What a survey that stands upright, seen from above, brings with it.
 OF_UPRIGHT = frozenset(
-    ("layers", "tear", "heights", "scale", "tilt", "yaw", "light", "surfaces", "up")
+    (
+        "layers",
+        "tear",
+        "upside_down",
+        "heights",
+        "scale",
+        "tilt",
+        "heading",
+        "pieces",
+        "light",
+        "surfaces",
+        "up",
+    )
 )
+
+
+def _dip(found: Found, which: int) -> float | None:
+    return None if found.dips is None else found.dips[which]
+
+
+def _size(tear: Tear | None) -> float | None:
+    return None if tear is None else tear.size
+
+
+def _numbers(**values: float | None) -> dict[str, float]:
+    return {
+        name: float(value)
+        for name, value in values.items()
+        if value is not None and np.isfinite(value)
+    }
 
 
 def findings(found: Found) -> tuple[Finding, ...]:
     """Return what speaks against accepting the pair, each with its code."""
     upright = found.dips is not None and max(found.dips) >= WALL
-    told = [(code, rule(found)) for code, rule in RULES if not (upright and code in OF_UPRIGHT)]
-    return tuple(Finding(code, said) for code, said in told if said)
+    told = []
+    for code, rule in RULES:
+        said = rule(found)
+        if isinstance(said, str) and said:
+            said = Finding(code, said, values=VALUES[code](found) if code in VALUES else {})
+        if isinstance(said, Finding) and not (upright and said.code in OF_UPRIGHT):
+            told.append(said)
+    return tuple(told)
 
 
 def last_word(judgement: Judgement, against: Sequence[Finding]) -> Judgement:
     """Return the judgement of the place, no better than "review" where anything speaks against."""
-    said = "; ".join(finding.said for finding in against)
-    if any(finding.code == "far" for finding in against):  # it explains why nothing was found
-        return replace(judgement.doubted(said), reason=said)
-    return judgement.doubted(said)
+    said = judgement.downgraded(against)
+    if any(finding.code in FAR for finding in against):  # it explains why nothing was found
+        return replace(said, reason="; ".join(finding.text for finding in against))
+    return said

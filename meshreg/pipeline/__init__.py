@@ -4,6 +4,7 @@ Rasters of both (`levels`), the methods' proposals of Bryson et al. (2013) judge
 (`decision`), and the record (`register`); a check on the user's own data (`selftest`).
 """
 
+from meshreg.pipeline.checks import require_different
 from meshreg.pipeline.decision import (
     Decision,
     Manual,
@@ -15,11 +16,8 @@ from meshreg.pipeline.postures import (
     level_axes,
     posture,
 )
-from meshreg.pipeline.register import (
-    register_pair,
-    require_different,
-    versions,
-)
+from meshreg.pipeline.recording import versions
+from meshreg.pipeline.register import register_pair
 from meshreg.pipeline.selftest import (
     self_test,
 )

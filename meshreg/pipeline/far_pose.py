@@ -17,7 +17,7 @@ from meshreg.heading import near_offset
 from meshreg.judge import channel_maps
 from meshreg.offsets.correlate import Window
 from meshreg.raster.grid import coarsened
-from meshreg.records import Float32, Grid, SurveyRaster
+from meshreg.records import Finding, Float32, Grid, SurveyRaster
 from meshreg.settings import SearchSettings
 
 log = logging.getLogger(__name__)
@@ -30,8 +30,8 @@ MOST = 300_000  # cells of a transform, so that all trials take seconds
 
 def far_pose(
     pairs: Mapping[str, tuple[SurveyRaster, SurveyRaster]], radius: float, search: SearchSettings
-) -> str:
-    """Name the turn or the scale at which the surveys would fit; '' for none.
+) -> Finding | None:
+    """Name the turn or the scale at which the surveys would fit; None for none.
 
     Parameters
     ----------
@@ -48,10 +48,10 @@ def far_pose(
     reference, moving = coarsened(reference, times), coarsened(moving, times)
     window = Window.around(_snapped(reference).grid, _snapped(moving).grid, radius)
     if window.empty:
-        return ""
+        return None
     if math.prod(window.padded) > MOST:
         log.info("no far turn or scale was tried: the search window is too large")
-        return ""
+        return None
     reference = _snapped(reference)
     tried = [(math.radians(yaw), 1.0) for yaw in range(-180, 180, STEP)]
     tried += [(0.0, RATIO**power) for power in range(-18, 19) if power]
@@ -66,16 +66,18 @@ def far_pose(
             best, found = sum(gaps), (yaw, scale)
     yaw, scale = found
     if abs(yaw) > math.radians(search.max_yaw + 0.5 * STEP):
-        return (
+        said = (
             f"the moving survey is turned by about {-math.degrees(yaw):+.0f}°, further than is "
             "searched: check its heading, or turn it back first"
         )
+        return Finding("turned", said, values={"degrees": -math.degrees(yaw)})
     if abs(math.log(scale)) > math.log1p(search.max_scale) + 0.5 * math.log(RATIO):
-        return (
+        said = (
             f"the moving survey is about {1 / scale:.2f} times as large as the reference, further "
             "off than is searched: check the units (--unit) and the scale"
         )
-    return ""
+        return Finding("resized", said, values={"times": 1 / scale})
+    return None
 
 
 def posed(raster: SurveyRaster, yaw: float, scale: float) -> SurveyRaster:

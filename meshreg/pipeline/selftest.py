@@ -17,10 +17,10 @@ import numpy as np
 
 from meshreg.errors import UsageError
 from meshreg.heading import Pairs, Turn, turning
+from meshreg.pipeline.checks import prepared, require_different, surveys_apart
 from meshreg.pipeline.decision import Decision, completed, decide
 from meshreg.pipeline.levels import rasterize_pair
 from meshreg.pipeline.postures import in_degrees
-from meshreg.pipeline.register import prepared, require_different, surveys_apart
 from meshreg.records import Float64, Survey, Transform, Verdict
 from meshreg.settings import Settings
 
@@ -207,7 +207,7 @@ def self_test(
     masks = {"reference": reference_mask, "moving": moving_mask}
     cell = float(settings.raster.dem_cell or 0.0)
     if apart := surveys_apart(reference, moving, radius):
-        return SelfTest("rejected", apart, cell)
+        return SelfTest("rejected", "; ".join(finding.text for finding in apart), cell)
     tell("rasterize", 0.0)
     pairs = rasterize_pair(reference, moving, settings, masks, tell)
 

@@ -22,6 +22,7 @@ from meshreg.records.finding import (
     Finding,
     Gain,
     Layer,
+    Severity,
     Tear,
 )
 from meshreg.records.grid import (
@@ -65,6 +66,7 @@ __all__ = [
     "OffsetEstimate",
     "PointCloud",
     "Registration",
+    "Severity",
     "SourceFile",
     "Status",
     "Survey",

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 
-from meshreg.records.arrays import Float64
+from meshreg.records.arrays import NOTHING, Float64
 
 
 @dataclass(frozen=True)
@@ -90,9 +92,26 @@ class Tear:
         return float(np.linalg.norm(self.apart))
 
 
+Severity = Literal["review", "rejected"]
+
+
 @dataclass(frozen=True)
 class Finding:
-    """One thing that speaks against accepting a pair: a short code and a sentence for people."""
+    """One thing that speaks against accepting a pair.
+
+    Attributes
+    ----------
+    code : str
+        What it is, for programs: `meshreg.judge.CODES` has all of them.
+    text : str
+        A sentence for people.
+    severity : "review" or "rejected"
+        The best verdict that it leaves.
+    values : mapping
+        The numbers in the text, by name; lengths in metres.
+    """
 
     code: str
-    said: str
+    text: str
+    severity: Severity = "review"
+    values: Mapping[str, float] = field(default_factory=lambda: NOTHING)

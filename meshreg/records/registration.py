@@ -53,8 +53,8 @@ class Registration:
         Chance that unrelated ground would make the best hypothesis stand out as much, measured on
         the pair itself (`meshreg.judge`).
     findings : tuple of Finding
-        What later stages found against accepting the pair (`judge.verdict`), in the order of the
-        reason; empty where nothing was.
+        What speaks against accepting the pair (`judge.verdict`), in the order of the reason; empty
+        where nothing does.
     heights_gain : mapping or None
         How many times as high the moving survey's relief is as the reference's: `value`, and
         `sigma` of its natural logarithm (`height.gain`), both None with the `reason` where that
@@ -81,7 +81,7 @@ class Registration:
     seconds: Mapping[str, float]
     notes: tuple[str, ...] = ()
     evidence: Mapping[str, Any] = field(default_factory=lambda: NOTHING)
-    schema: str = "meshreg.registration/1"
+    schema: str = "meshreg.registration/2"
     registration_error: Mapping[str, Any] | None = None
     internal: Mapping[str, Any] | None = None
     warp: Warp | None = None

@@ -17,7 +17,7 @@ import numpy as np
 from meshreg.offsets import neutral
 from meshreg.offsets.channels import smooth
 from meshreg.offsets.surface import MAD_TO_SIGMA
-from meshreg.records import Bool, Float64, OffsetAt, SurveyRaster
+from meshreg.records import Bool, Finding, Float64, OffsetAt, SurveyRaster
 from meshreg.refine.tiles import (
     MAX_YAW,
     Overlap,
@@ -65,7 +65,7 @@ class Refined:
     weights : (M,) float64
     note : str
         What the user should know.
-    doubt : str
+    doubt : Finding or None
         Why the answer cannot be accepted, if so.
     undecided : float
         Where the image alone tells: what its tones and edges disagree by, in cells (one sigma).
@@ -81,7 +81,7 @@ class Refined:
     residuals: Float64 | None = None
     weights: Float64 | None = None
     note: str = ""
-    doubt: str = ""
+    doubt: Finding | None = None
     scale_variance: float = 0.0
     undecided: float = 0.0
     offset_at: OffsetAt | None = None
@@ -143,10 +143,12 @@ def refine(
         best = _stated(best, PEAK_RESOLUTION * max(moving.grid.cell for _, moving, _ in rasters))
     if abs(best.yaw) > MAX_YAW:
         turn = np.rad2deg(best.yaw)
-        return replace(coarse, doubt=f"the surveys are turned by about {turn:.1f}°, beyond ±1°")
+        said = f"the surveys are turned by about {turn:.1f}°, beyond ±1°"
+        return replace(coarse, doubt=Finding("heading", said, values={"degrees": turn}))
     moved = float(np.hypot(*(best.offset - offset)))
     if moved > agree:
-        return replace(coarse, doubt=f"tiles alone lie {moved:.2f} m from the whole's offset")
+        said = f"tiles alone lie {moved:.2f} m from the whole's offset"
+        return replace(coarse, doubt=Finding("pieces", said, values={"apart": moved}))
     return best
 
 

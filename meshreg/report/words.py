@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from typing import Any
 
 from meshreg.records import Registration
@@ -20,180 +19,124 @@ _LOOK = (
 )
 # What the reason says, and what helps. `{wider}` is twice the search radius.
 _UP_UNKNOWN = 0.14  # m; two depths of 5 cm each, as where nothing tells what sand did
-_ADVICE: tuple[tuple[str, tuple[str, ...]], ...] = (
-    (
-        r"surveys lie \S+ m apart",
-        ("The coordinates of the surveys do not meet: report.html shows where they lie.",),
-    ),
-    (
-        # where other axes do not bring them together
-        r"surveys lie \S+ m apart, (?!.* agree if )",
-        (
-            "Shifts (--reference-shift, --moving-shift) are east, north, up in metres that are "
-            "added to a file's coordinates. Check each file's coordinate system too.",
-        ),
-    ),
-    (
-        r"when (turned|mirrored)|with east and north",
-        (
-            "One of the files has its axes exchanged or mirrored. Check --axes (enu or ned) and "
-            "--up (y or z), or write them into a NAME.survey.toml beside the file that differs.",
-            "`meshreg info FILE` says which axes a file seems to have.",
-        ),
-    ),
-    (
-        r"contradict each other",
-        (
-            "Relief and image put the survey at different places; one of them is deceived, for "
-            "example by ripples, by a changed bottom, or by moving plants.",
-            _LOOK,
-            "Mask what moves or what repeats itself (--mask not:FILE), and register again.",
-        ),
-    ),
-    (
-        r"stands out from chance",
-        (
-            "Make sure that both surveys show the same ground: compare them in report.html.",
-            "If their coordinates may be off by more than {radius:g} m, search further "
-            "(--search-radius {wider:g}), or give the shift that is known (--moving-shift).",
-            "Mask what moved or grew (--mask not:FILE). Check units (--unit) and axes (--axes).",
-        ),
-    ),
-    (
-        r"overlap by only",
-        (
-            "So narrow a common strip may fit by luck. " + _LOOK,
-            "A larger survey, or one that lies further over the other, would settle it.",
-        ),
-    ),
-    (
-        r"too little to know the place by",
-        (
-            "Flat ground has nothing that the relief could be known by. " + _LOOK,
-            "Color may know it: export the models with textures or vertex colors. So may a larger "
-            "survey, one that reaches rougher ground.",
-        ),
-    ),
-    (
-        r"search border|outside the search radius",
-        ("The true offset may lie further out: register again with --search-radius {wider:g}.",),
-    ),
-    (
-        r"turned by about",
-        (
-            "The heading of one survey is off by more than this registration corrects. Align the "
-            "model to north again in the software that made it, or check its camera positions.",
-        ),
-    ),
-    (
-        r"too (small|large)|times as large",
-        (
-            "The lengths of the surveys differ. Check the scale bars or camera positions of the "
-            "model that is wrong, and make it again; growth does not stretch the ground.",
-        ),
-    ),
-    (
-        r"recurs upside down",
-        (
-            "Export the survey whose heights are depths with up counted upwards, or state its axes "
-            "in a NAME.survey.toml beside it.",
-        ),
-    ),
-    (
-        r"times those of the other",
-        (
-            "Export both models with heights and plan in the same unit (--unit m, ft, ...; "
-            'unit = "ft" in a NAME.survey.toml beside the file that differs), without vertical '
-            "exaggeration. A GeoTIFF's heights may be in feet though its plan is in metres.",
-        ),
-    ),
-    (
-        r"second copy of its surface",
-        (
-            "Parts of the model do not lie on each other, as after an alignment of images or scans "
-            "in two groups. Align all of them in one block, or leave one group out, and export "
-            "again.",
-        ),
-    ),
-    (
-        r"torn, or slid",
-        (
-            "Look along that part's border in report.html. If a model is torn there, align its "
-            "images again with more ties between both parts; if the ground has slid, mask the part "
-            "that did (--mask not:FILE).",
-        ),
-    ),
-    (
-        r"agree if .* read with",
-        (
-            "Axes are stated by --up and --axes for both files, or for one by NAME.survey.toml "
-            "beside it. `meshreg info FILE` then shows its bounds and whether it lies level.",
-        ),
-    ),
-    (
-        r"look like degrees",
-        (
-            "Longitude and latitude are projected to metres once their CRS is known: write it into "
-            "NAME.survey.toml beside the file, or export in a projected CRS (UTM).",
-        ),
-    ),
-    (
-        r"both surveys stand upright",
-        (
-            "Seen from above a steep wall shows nothing. Turn both models by the same known "
-            "rotation, so that the wall lies level, and register those.",
-        ),
-    ),
-    (
-        r"the answer tilts",
-        (
-            "Align both models to the vertical in the software that made them, or check --up and "
-            "--axes of each file.",
-        ),
-    ),
-    (
-        r"more than the whole relief",
-        ("Check the height's unit and datum of both files. " + _LOOK,),
-    ),
-    (
-        r"tie points",
-        (
-            "Look at the points with the largest residuals in `meshreg validate OUT ties.csv`: "
-            "either they are not of the same feature, or the answer is wrong. " + _LOOK,
-        ),
-    ),
-    (
-        r"tilted against",
-        (
-            "One model leans by more than this registration corrects. Align it to the vertical in "
-            "the software that made it (camera positions, depth, level markers), or check --up.",
-        ),
-    ),
-    (
-        r"tiles alone lie",
-        (
-            "Pieces of the survey ask for another offset than the whole: the model may be bent, "
-            "scaled, or its ground may have moved. Look at the residual field in report.html.",
-            _LOOK,
-        ),
-    ),
-    (
-        r"chance could do as well|stands out, and not overwhelmingly",
-        (
-            _LOOK,
-            "More common ground, finer textures, or a mask over what changed (--mask not:FILE) "
-            "give the answer more weight; so does a smaller --search-radius where the offset is "
-            "known to be small.",
-        ),
-    ),
-    (
-        r"do not overlap|no method found",
-        (
-            "There is too little in common to compare. Check that both files are whole, and their "
-            "shifts, axes and units (`meshreg info FILE`).",
-        ),
-    ),
+_ALIGN = (
+    "The heading of one survey is off by more than this registration corrects. Align the "
+    "model to north again in the software that made it, or check its camera positions."
 )
+_LENGTHS = (
+    "The lengths of the surveys differ. Check the scale bars or camera positions of the "
+    "model that is wrong, and make it again; growth does not stretch the ground."
+)
+_SHIFTS = (
+    "Shifts (--reference-shift, --moving-shift) are east, north, up in metres that are "
+    "added to a file's coordinates. Check each file's coordinate system too."
+)
+_COMMON = (
+    _LOOK,
+    "More common ground, finer textures, or a mask over what changed (--mask not:FILE) "
+    "give the answer more weight; so does a smaller --search-radius where the offset is "
+    "known to be small.",
+)
+# What to do, by the code of a finding (`meshreg.judge.CODES`).
+ADVICE: dict[str, tuple[str, ...]] = {
+    "degrees": (
+        "Longitude and latitude are projected to metres once their CRS is known: write it into "
+        "NAME.survey.toml beside the file, or export in a projected CRS (UTM).",
+    ),
+    "apart": ("The coordinates of the surveys do not meet: report.html shows where they lie.",),
+    "nothing": (
+        "There is too little in common to compare. Check that both files are whole, and their "
+        "shifts, axes and units (`meshreg info FILE`).",
+    ),
+    "turned": (_ALIGN,),
+    "resized": (_LENGTHS,),
+    "axes": (
+        "Axes are stated by --up and --axes for both files, or for one by NAME.survey.toml "
+        "beside it. `meshreg info FILE` then shows its bounds and whether it lies level.",
+    ),
+    "mirrored": (
+        "One of the files has its axes exchanged or mirrored. Check --axes (enu or ned) and "
+        "--up (y or z), or write them into a NAME.survey.toml beside the file that differs.",
+        "`meshreg info FILE` says which axes a file seems to have.",
+    ),
+    "upright": (
+        "Seen from above a steep wall shows nothing. Turn both models by the same known "
+        "rotation, so that the wall lies level, and register those.",
+    ),
+    "lean": (
+        "Align both models to the vertical in the software that made them, or check --up and "
+        "--axes of each file.",
+    ),
+    "layers": (
+        "Parts of the model do not lie on each other, as after an alignment of images or scans "
+        "in two groups. Align all of them in one block, or leave one group out, and export "
+        "again.",
+    ),
+    "tear": (
+        "Look along that part's border in report.html. If a model is torn there, align its "
+        "images again with more ties between both parts; if the ground has slid, mask the part "
+        "that did (--mask not:FILE).",
+    ),
+    "upside_down": (
+        "Export the survey whose heights are depths with up counted upwards, or state its axes "
+        "in a NAME.survey.toml beside it.",
+    ),
+    "heights": (
+        "Export both models with heights and plan in the same unit (--unit m, ft, ...; "
+        'unit = "ft" in a NAME.survey.toml beside the file that differs), without vertical '
+        "exaggeration. A GeoTIFF's heights may be in feet though its plan is in metres.",
+    ),
+    "scale": (_LENGTHS,),
+    "tilt": (
+        "One model leans by more than this registration corrects. Align it to the vertical in "
+        "the software that made it (camera positions, depth, level markers), or check --up.",
+    ),
+    "heading": (_ALIGN,),
+    "pieces": (
+        "Pieces of the survey ask for another offset than the whole: the model may be bent, "
+        "scaled, or its ground may have moved. Look at the residual field in report.html.",
+        _LOOK,
+    ),
+    "light": (
+        "Light from another side moves the shadows, and with them what the image says. " + _LOOK,
+        "Relief would settle it: a finer DEM, or a survey that reaches rougher ground.",
+    ),
+    "surfaces": (
+        "The 3-D surfaces ask for another place than the maps. Look at the height differences in "
+        "report.html, or register without refine.surfaces.",
+    ),
+    "up": ("Check the height's unit and datum of both files. " + _LOOK,),
+    "ties": (
+        "Look at the points with the largest residuals in `meshreg validate OUT ties.csv`: "
+        "either they are not of the same feature, or the answer is wrong. " + _LOOK,
+    ),
+    "contradiction": (
+        "Relief and image put the survey at different places; one of them is deceived, for "
+        "example by ripples, by a changed bottom, or by moving plants.",
+        _LOOK,
+        "Mask what moves or what repeats itself (--mask not:FILE), and register again.",
+    ),
+    "chance": (
+        "Make sure that both surveys show the same ground: compare them in report.html.",
+        "If their coordinates may be off by more than {radius:g} m, search further "
+        "(--search-radius {wider:g}), or give the shift that is known (--moving-shift).",
+        "Mask what moved or grew (--mask not:FILE). Check units (--unit) and axes (--axes).",
+    ),
+    "overlap": (
+        "So narrow a common strip may fit by luck. " + _LOOK,
+        "A larger survey, or one that lies further over the other, would settle it.",
+    ),
+    "flat": (
+        "Flat ground has nothing that the relief could be known by. " + _LOOK,
+        "Color may know it: export the models with textures or vertex colors. So may a larger "
+        "survey, one that reaches rougher ground.",
+    ),
+    "border": (
+        "The true offset may lie further out: register again with --search-radius {wider:g}.",
+    ),
+    "weak": _COMMON,
+    "alone": _COMMON,
+}
 _FALLBACK = {
     "review": (
         _LOOK,
@@ -213,12 +156,14 @@ def next_steps(registration: Registration) -> tuple[str, ...]:
     if registration.verdict == "accepted":
         return ()
     radius = _of(registration.settings, "search", "radius") or 10.0
+    codes = [finding.code for finding in registration.findings]
     steps = [
         step.format(radius=radius, wider=2 * radius)
-        for pattern, found in _ADVICE
-        if re.search(pattern, registration.reason)
-        for step in found
+        for code in codes
+        for step in ADVICE.get(code, ())
     ]
+    if "apart" in codes and "axes" not in codes:
+        steps.append(_SHIFTS)
     return tuple(dict.fromkeys(steps or _FALLBACK[registration.verdict]))
 
 

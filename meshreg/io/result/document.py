@@ -21,7 +21,8 @@ from meshreg.io.files.safe import open_regular
 from meshreg.records import Finding, OffsetEstimate, Registration, Transform, Warp
 from meshreg.settings.checked import shown
 
-SCHEMA = "meshreg.registration/1"
+SCHEMA = "meshreg.registration/2"
+READ = ("meshreg.registration/1", SCHEMA)
 MAX_BYTES = 64_000_000  # a real record has some 20 kB
 _NUMBERS = ("overlap", "height_median", "height_nmad", "height_rmse", "image_similarity")
 
@@ -55,7 +56,10 @@ def registration_document(registration: Registration) -> dict[str, Any]:
         "covariance": None if covariance is None else covariance.tolist(),
         "registration_error": registration.registration_error,
         "false_alarm": registration.false_alarm,
-        "findings": [{"code": f.code, "said": f.said} for f in registration.findings],
+        "findings": [
+            {"code": f.code, "severity": f.severity, "text": f.text, "values": dict(f.values)}
+            for f in registration.findings
+        ],
         "heights_gain": registration.heights_gain,
         "internal": registration.internal,
         "warp": None if registration.warp is None else _warp_document(registration.warp),
@@ -208,7 +212,7 @@ def _parse(text: bytes, path: Path) -> dict[str, Any]:
             file=path,
             remedy="Give the registration.json that `meshreg register` wrote.",
         )
-    if found[1] != SCHEMA.rpartition("/")[2]:
+    if schema not in READ:
         raise InputError(
             f"has schema {schema}; this meshreg reads {SCHEMA}.",
             file=path,
@@ -240,15 +244,20 @@ def _registration(document: dict[str, Any], path: Path) -> Registration:
             registration_error=document.get("registration_error"),
             internal=document.get("internal"),
             false_alarm=document.get("false_alarm"),
-            findings=tuple(
-                Finding(str(item["code"]), str(item["said"]))
-                for item in document.get("findings") or ()
-            ),
+            findings=tuple(map(_finding, document.get("findings") or ())),
             heights_gain=document.get("heights_gain"),
             warp=_warp(document.get("warp")),
         )
     except UsageError as error:  # a record refused at birth; here the file is to blame
         raise InputError(f"contradicts itself: {error.message}", file=path) from error
+
+
+def _finding(item: Mapping[str, Any]) -> Finding:
+    """Return a finding; those of version 1 had a code and a text that was called `said`."""
+    if "said" in item:
+        return Finding(str(item["code"]), str(item["said"]))
+    values = {str(name): float(value) for name, value in item["values"].items()}
+    return Finding(str(item["code"]), str(item["text"]), item["severity"], values)
 
 
 def _transform(document: dict[str, Any], path: Path) -> Transform | None:
