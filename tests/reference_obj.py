@@ -51,7 +51,7 @@ def read_number(word: str, line: int) -> float:
             raise ValueError
         return float(word)
     except ValueError:
-        raise PlainError(line, f"{word} is no number") from None
+        raise PlainError(line, f"{word} is not a number") from None
 
 
 def parse_plain(text: str) -> PlainObj:

@@ -1043,7 +1043,7 @@ def test_values_for_one_or_both() -> None:
 
 
 def test_bars_on_a_terminal() -> None:
-    voice = console.Voice()
+    voice = console.Terminal()
     voice.err = Console(force_terminal=True, width=100, record=True, file=io.StringIO())
     with console.Progress(voice) as progress:
         progress("sift", 0.0)

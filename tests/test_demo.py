@@ -109,7 +109,7 @@ def test_what_a_person_reads(tmp_path: Path, verdict: str) -> None:
     (tmp_path / "figures").mkdir()
     truth = truth_beside(np.array([0.3, -0.4, 0.05]), 0.0)
     done = demonstrating.compared(made_registration(verdict), truth)
-    voice = console.Voice()
+    voice = console.Terminal()
     voice.out = Console(record=True, width=200, file=io.StringIO())
     demonstrating.show(done, tmp_path, voice)
     said = voice.out.export_text()

@@ -26,7 +26,7 @@ def apart(monkeypatch):
 
 
 def test_a_small_pair_gets_no_process_of_its_own():
-    with drawing.draughtsman(SMALL, SMALL) as begin:
+    with drawing.figure_worker(SMALL, SMALL) as begin:
         finish = begin("registration", "folder")
     assert finish.func is draw_figures
     assert finish.args == ("registration", "folder")
@@ -37,7 +37,7 @@ def test_a_small_pair_gets_no_process_of_its_own():
 def test_both_processes_draw_the_same(tmp_path: Path, patient: int) -> None:
     """Whether this one helps from the beginning, with the rest, or hardly at all."""
     registration = made_registration("accepted")
-    with drawing.draughtsman(SMALL, SMALL) as begin:
+    with drawing.figure_worker(SMALL, SMALL) as begin:
         finish = begin(registration, tmp_path / "there")
         while patient and len(list((tmp_path / "there").glob("*.png"))) < patient:
             time.sleep(0.02)
@@ -56,7 +56,7 @@ def test_what_it_says_is_logged_here(tmp_path: Path, caplog: pytest.LogCaptureFi
     accepted = made_registration("accepted")
     evidence = {**accepted.evidence, "residuals": {"east": np.zeros(2)}}
     broken = dataclasses.replace(accepted, evidence=evidence)
-    with caplog.at_level(logging.INFO, "meshreg"), drawing.draughtsman(SMALL) as begin:
+    with caplog.at_level(logging.INFO, "meshreg"), drawing.figure_worker(SMALL) as begin:
         begin(broken, tmp_path)()
     assert any("residuals was not drawn" in message for message in caplog.messages)
     assert not (tmp_path / "residuals.png").exists()
@@ -67,7 +67,7 @@ def test_what_it_says_is_logged_here(tmp_path: Path, caplog: pytest.LogCaptureFi
 def test_an_error_there_is_an_error_here(tmp_path: Path) -> None:
     taken = tmp_path / "taken"
     taken.write_text("a file where the folder should be")
-    with drawing.draughtsman(SMALL) as begin, pytest.raises(FileExistsError):
+    with drawing.figure_worker(SMALL) as begin, pytest.raises(FileExistsError):
         begin(made_registration("rejected"), taken)()
 
 
@@ -84,7 +84,7 @@ def test_if_it_dies_the_figures_are_drawn_here(
         return started[-1]
 
     monkeypatch.setattr(context, "Process", noted)
-    with drawing.draughtsman(SMALL) as begin:
+    with drawing.figure_worker(SMALL) as begin:
         os.kill(started[0].pid, signal.SIGKILL)
         started[0].join(10)
         begin(made_registration("rejected"), tmp_path)()

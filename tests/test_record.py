@@ -39,7 +39,7 @@ def strict(text: str) -> Any:
     """Parse JSON as other programs do: NaN and Infinity are errors."""
 
     def refuse(constant: str) -> None:
-        raise AssertionError(f"{constant} is no JSON")
+        raise AssertionError(f"{constant} is not a JSON")
 
     return json.loads(text, parse_constant=refuse)
 

@@ -18,8 +18,8 @@ from meshreg.refine.rigid import (
     blended,
     combined,
     fit,
+    fit_overlap,
     misfit,
-    over_ground,
     refine,
     relief_height,
     with_scale,
@@ -261,7 +261,7 @@ def test_there_and_back_is_nothing_within_three_sigmas(size):
                 return np.abs(places + offset(places)).max(axis=1) < 9
 
             ground = uniform_ground(lambda p, seen=seen: (np.abs(p).max(axis=1) < 9) & seen(p))
-            answers.append(over_ground(found, ground, ground.share @ ground.places))
+            answers.append(fit_overlap(found, ground, ground.share @ ground.places))
         first, second = answers
         home = first.pivot + first.offset
         arm = home - second.pivot
@@ -300,7 +300,7 @@ def rim(seed, bend):
 
 def missed(tiles, ground, best):
     """Metres from the best fit, the same in sigmas, the sigma of east [m]."""
-    found = over_ground(tiles, ground, np.zeros(2))
+    found = fit_overlap(tiles, ground, np.zeros(2))
     miss, covariance = found.offset - best[:2], found.covariance[:2, :2]
     sigmas = np.sqrt(miss @ np.linalg.solve(covariance, miss))
     return float(np.hypot(*miss)), float(sigmas), float(np.sqrt(covariance[0, 0]))
@@ -367,7 +367,7 @@ def test_a_tile_weighs_by_what_its_fit_says():
         offsets = np.array([0.3, -0.2]) + rng.normal(0, np.sqrt(noise))
         for name, told in (("alike", None), ("told", noise)):
             found = TileOffsets(places, offsets, np.arange(49), np.zeros(49, int), 45, told)
-            answer = over_ground(found, ground, pivot)
+            answer = fit_overlap(found, ground, pivot)
             error[name].append(answer.offset - (0.3, -0.2))
         stated.append(np.trace(answer.covariance[:2, :2]))
     size = {name: np.mean(np.square(e).sum(axis=1)) for name, e in error.items()}

@@ -152,9 +152,9 @@ def test_command_refuses_another_place_with_exit_code_4(files, capsys):
 
 
 def test_table_names_what_can_be_resolved(capsys):
-    from meshreg.cli.console import Voice
+    from meshreg.cli.console import Terminal
 
-    selftesting.show(good()[0].document(), Voice())
+    selftesting.show(good()[0].document(), Terminal())
     said = capsys.readouterr().out
     assert "smallest shift that this plot can resolve" in said
     assert said.count("accepted") == 2

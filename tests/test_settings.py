@@ -114,7 +114,7 @@ NUMBERS = [(key, kind, limits) for key, kind, limits in every_setting() if limit
 
 @pytest.mark.parametrize(("key", "kind", "limits"), NUMBERS, ids=[key for key, *_ in NUMBERS])
 def test_each_number_is_held_to_its_range(key, kind, limits):
-    """Both ends, what lies just beyond them, and what is no number at all."""
+    """Both ends, what lies just beyond them, and what is not a number at all."""
     whole = kind.startswith("int")
     step = 1 if whole else 1e-9
 

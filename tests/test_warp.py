@@ -17,8 +17,8 @@ from scipy.interpolate import BSpline
 import meshreg
 from meshreg.apply import apply_transform
 from meshreg.cli import app as cli
-from meshreg.deformation.internal import Internal, check_model, measure
-from meshreg.deformation.ladder import FALL, Sample, choose, climb, intervals, steepest, strain
+from meshreg.deformation.internal import Deformation, check_model, measure
+from meshreg.deformation.models import FALL, Sample, choose, fit_models, intervals, steepest, strain
 from meshreg.deformation.warp_rasters import common_value, warped_raster
 from meshreg.errors import InputError, UsageError
 from meshreg.io import read_survey, require_warpable, rewrite_survey, write_survey
@@ -176,7 +176,7 @@ def test_a_horizontal_bend_is_named_and_recovered(model, seed):
     field, most = FIELDS[model]
     values = field(places) + rigid(places, rng)
     sample = sample_of(values + rng.normal(0, NOISE, values.shape))
-    best = choose(climb(sample), sample, 0.10)
+    best = choose(fit_models(sample), sample, 0.10)
     assert best.model == model
     error = said_by(best, sample, places) - values
     assert np.sqrt((error**2).sum(axis=1).mean()) < most
@@ -188,7 +188,7 @@ def test_a_dome_is_named_and_its_height_recovered(height):
     places = lattice()
     values = up_dome(places, height) + 0.001 * places[:, :1] - 0.02
     sample = sample_of(values + rng.normal(0, NOISE, values.shape))
-    best = choose(climb(sample), sample, 0.05)
+    best = choose(fit_models(sample), sample, 0.05)
     assert best.model == "dome"
     ends = said_by(best, sample, np.array([[0, 0], *(HALF * np.array(
         [[1, 1], [1, -1], [-1, 1], [-1, -1]]
@@ -204,7 +204,7 @@ def test_noise_alone_is_rigid(dimension):
         rng = np.random.default_rng(seed)
         left = rigid(places, rng) if dimension == 2 else 0.001 * places[:, :1]
         sample = sample_of(left + rng.normal(0, NOISE, (len(places), dimension)))
-        chosen.append(choose(climb(sample), sample, np.inf).model)
+        chosen.append(choose(fit_models(sample), sample, np.inf).model)
     assert chosen.count("rigid") >= 11
 
 
@@ -213,7 +213,7 @@ def test_few_tiles_stay_rigid():
     places = lattice()[::7]
     values = np.stack([0.02 * (places[:, 1] / HALF) ** 2, 0 * places[:, 0]], axis=1)
     sample = sample_of(values, places)
-    assert {step.model for step in climb(sample)} == {"rigid"}
+    assert {step.model for step in fit_models(sample)} == {"rigid"}
 
 
 @pytest.mark.parametrize("bend", [0.0, 0.06])
@@ -226,7 +226,7 @@ def test_ground_that_has_changed_is_not_absorbed(bend, grown):
     values = up_dome(places, bend)
     seen = values + rng.normal(0, 0.004, values.shape) - grown * patch[:, None]
     sample = sample_of(seen)
-    best = choose(climb(sample), sample, 0.05)
+    best = choose(fit_models(sample), sample, 0.05)
     assert best.model == ("dome" if bend else "rigid")
     assert np.abs(said_by(best, sample, places) - values)[patch].max() < 0.006
     assert (best.weights[patch] == 0).all()
@@ -241,7 +241,7 @@ def test_wild_tiles_do_not_bend_the_survey():
     wild = rng.choice(49, 8, replace=False)
     seen[wild] += rng.uniform(0.1, 0.25, (8, 2)) * rng.choice([-1, 1], (8, 2))
     sample = sample_of(seen)
-    best = choose(climb(sample), sample, 0.05)
+    best = choose(fit_models(sample), sample, 0.05)
     error = said_by(best, sample, places) - values
     assert np.sqrt((error**2).sum(axis=1).mean()) < 0.008
     assert (best.weights[wild] == 0).all()
@@ -257,11 +257,11 @@ def test_tiles_that_share_a_block_are_held_out_together():
         np.tile(places, (2, 1)), np.tile(values, (2, 1)), np.tile(np.arange(49), 2),
         np.repeat([0, 1], 49), SIDE, once.low, once.high,
     )  # fmt: skip
-    for one, two in zip(climb(once), climb(twice), strict=True):
+    for one, two in zip(fit_models(once), fit_models(twice), strict=True):
         assert one.model == two.model
         if one.model != "spline":  # whose energy is weighed against the number of tiles
             np.testing.assert_allclose(two.held[:49], one.held, rtol=0.05, atol=1e-4)
-    assert choose(climb(twice), twice, np.inf).model == "rigid"
+    assert choose(fit_models(twice), twice, np.inf).model == "rigid"
 
 
 def test_held_out_is_what_a_fit_without_the_tile_says():
@@ -269,7 +269,7 @@ def test_held_out_is_what_a_fit_without_the_tile_says():
     places = lattice()[:25]
     values = np.random.default_rng(8).normal(0, NOISE, (25, 1))
     sample = sample_of(values, places)
-    from meshreg.deformation import ladder
+    from meshreg.deformation import models as ladder
     from meshreg.statistics import held_out
 
     design = ladder._polynomials(places, sample, "rigid")
@@ -361,7 +361,7 @@ def test_a_bend_of_cameras_is_within_the_strain_that_is_allowed(rms):
         bend = make_distortion(sfm, rng, np.zeros(3), 2 * HALF)
         values = (bend.reference_from_moving(places) - places)[:, :2]
         sample = sample_of(values + rng.normal(0, NOISE, values.shape))
-        best = choose(climb(sample), sample, WarpSettings().max_strain)
+        best = choose(fit_models(sample), sample, WarpSettings().max_strain)
         assert best.model == "spline"
         assert 0.04 * rms < best.strain < 0.01
         error = said_by(best, sample, lattice()) - values
@@ -384,7 +384,7 @@ def test_ground_that_has_changed_in_one_piece_is_not_bent_after(dimension, size)
         heading = np.array([np.cos(angle), np.sin(angle)]) if dimension == 2 else np.array([-1.0])
         amount = size * rng.uniform(0.5, 1.0, (49, 1)) * changed[:, None]
         sample = sample_of(amount * heading + rng.normal(0, 0.004, (49, dimension)))
-        steps = climb(sample)
+        steps = fit_models(sample)
         best = choose(steps, sample, 0.01)
         assert best.model == "rigid"
         assert np.abs(said_by(best, sample, places)[~changed]).max() < 0.006
@@ -398,7 +398,7 @@ def test_too_much_strain_is_refused():
     places = lattice()
     rng = np.random.default_rng(9)
     sample = sample_of(20 * flat_quadratic(places) + rng.normal(0, NOISE, (49, 2)))
-    steps = climb(sample)
+    steps = fit_models(sample)
     best = choose(steps, sample, np.inf)
     assert best.strain > 0.02
     assert choose(steps, sample, 0.01).strain <= 0.01
@@ -410,7 +410,7 @@ def test_a_fit_that_folds_the_ground_is_none():
     places = lattice()
     values = 2.0 * places[:, ::-1]
     sample = sample_of(values + np.random.default_rng(12).normal(0, NOISE, values.shape))
-    steps = climb(sample)
+    steps = fit_models(sample)
     assert {step.model for step in steps} == {"rigid", "similarity", "dome"}
     points = np.column_stack([places, np.zeros(49)])
     for step in steps:
@@ -458,8 +458,8 @@ def test_doming_is_named_and_measured():
     """The moving survey's middle is 6 cm too high, and it says so."""
     tiles, reference, moving = bent_pair(up=lambda p: up_dome(p, -0.06))
     found = measure(tiles, Transform(), reference, moving, WarpSettings())
-    assert "translation is not enough" in found.said
-    assert "doming" in found.said
+    assert "translation is not enough" in found.summary
+    assert "doming" in found.summary
     vertical = found.record["vertical"]
     assert vertical["model"] == "dome"
     assert vertical["doming"] == pytest.approx(0.06, abs=0.003)
@@ -471,7 +471,7 @@ def test_doming_is_named_and_measured():
 def test_a_pair_that_is_rigid_is_said_to_be():
     tiles, reference, moving = bent_pair()
     found = measure(tiles, Transform(), reference, moving, WarpSettings("auto"))
-    assert found.said.startswith("a rigid move is enough")
+    assert found.summary.startswith("a rigid move is enough")
     assert found.warp is None
     assert found.record["vertical"]["bend_rms"] == 0.0
 
@@ -518,11 +518,11 @@ def test_strain_over_the_limit_is_said_and_not_applied():
     tiles, reference, moving = bent_pair(flat=lambda p: 4 * flat_quadratic(p))
     loose = measure(tiles, Transform(), reference, moving, WarpSettings("auto", 0.05))
     value = loose.record["horizontal"]["strain"]
-    assert "max_strain" not in loose.said
+    assert "max_strain" not in loose.summary
     assert strain(loose.warp) == pytest.approx(value, rel=1e-9)
     found = measure(tiles, Transform(), reference, moving, WarpSettings("auto", 0.9 * value))
-    assert f"the horizontal bend strains the survey by {value:.1%}" in found.said
-    assert f"over the {0.9 * value:.1%} (warp.max_strain)" in found.said
+    assert f"the horizontal bend strains the survey by {value:.1%}" in found.summary
+    assert f"over the {0.9 * value:.1%} (warp.max_strain)" in found.summary
     assert found.warp is None or strain(found.warp) <= 0.9 * value
 
 
@@ -535,8 +535,8 @@ def test_ground_that_slid_is_told_and_not_called_a_bend():
     found = measure(tiles, Transform(), reference, moving, WarpSettings("auto"))
     assert found.warp is None
     assert found.record["horizontal"]["model"] == "rigid"
-    assert found.said.startswith("a rigid move is enough")
-    assert "20 of 49 tiles lie apart (horizontal), as changed ground does" in found.said
+    assert found.summary.startswith("a rigid move is enough")
+    assert "20 of 49 tiles lie apart (horizontal), as changed ground does" in found.summary
 
 
 def test_too_few_tiles_are_said():
@@ -544,7 +544,7 @@ def test_too_few_tiles_are_said():
     few = TileOffsets(tiles.places[:5], tiles.offsets[:5], tiles.block[:5], tiles.channel[:5])
     for some in (None, few):
         found = measure(some, Transform(), reference, moving, WarpSettings("auto"))
-        assert "too few tiles" in found.said
+        assert "too few tiles" in found.summary
         assert found.warp is None
         assert not found.record
 
@@ -687,7 +687,7 @@ def test_a_warp_survives_the_record(tmp_path: Path):
     assert names == (found.warp.horizontal, found.warp.vertical) == ("quadratic", "dome")
     assert again.internal == json.loads(text)["internal"]
     assert again.internal["applied"] is True
-    assert "transform.txt" in found.said
+    assert "transform.txt" in found.summary
 
 
 def test_the_schema_takes_it():
@@ -812,9 +812,9 @@ def test_a_pair_of_maps_goes_all_the_way():
 
 def test_internal_says_when_it_was_applied():
     warp = random_warp(0)
-    said = Internal("bent", {"applied": False}, warp).applied()
+    said = Deformation("bent", {"applied": False}, warp).applied()
     assert said.record["applied"] is True
-    assert said.said.startswith("bent; ")
+    assert said.summary.startswith("bent; ")
 
 
 def as_kind(raster, kind):

@@ -101,7 +101,9 @@ def _prepare(folder: Path, resume: bool, overwrite: bool) -> None:
     with as_output_error(folder):
         used = folder.exists() and (not folder.is_dir() or any(folder.iterdir()))
         if used and not (folder / MARKER).is_file():
-            raise UsageError("is no folder of a benchmark.", file=folder, remedy="Choose another.")
+            raise UsageError(
+                "is not a folder of a benchmark.", file=folder, remedy="Choose another."
+            )
         if used and not (resume or overwrite):
             raise UsageError(
                 "holds a benchmark already.", file=folder, remedy="Use --resume or --overwrite."

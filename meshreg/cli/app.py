@@ -51,7 +51,7 @@ from meshreg.cli.options import join_settings, survey_request, survey_requests
 from meshreg.errors import MeshregError, OutputError, UsageError
 
 if TYPE_CHECKING:
-    from meshreg.cli.console import Voice
+    from meshreg.cli.console import Terminal
     from meshreg.cli.guard import Unfinished
 
 Result = TypeVar("Result")
@@ -575,8 +575,8 @@ def validate(
 
 def _done(
     as_json: bool,
-    job: Callable[[Voice, Unfinished], Result],
-    show: Callable[[Result, Voice], None],
+    job: Callable[[Terminal, Unfinished], Result],
+    show: Callable[[Result, Terminal], None],
     document: Callable[[Result], Any] | None = None,
 ) -> Result:
     """Do a job, then print what came of it: for people, or as one JSON document."""
@@ -595,10 +595,10 @@ def _done(
     return result
 
 
-def _voice(as_json: bool) -> Voice:
-    from meshreg.cli.console import Voice
+def _voice(as_json: bool) -> Terminal:
+    from meshreg.cli.console import Terminal
 
-    return Voice(as_json)
+    return Terminal(as_json)
 
 
 def run(arguments: Sequence[str]) -> int:
@@ -653,7 +653,7 @@ def _failed(error: BaseException, as_json: bool, debug: bool) -> int:
     return 1
 
 
-def _usage(error: Any, voice: Voice) -> int:
+def _usage(error: Any, voice: Terminal) -> int:
     if voice.as_json:
         voice.error(UsageError(error.format_message(), remedy="See meshreg --help."))
     else:

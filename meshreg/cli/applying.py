@@ -18,7 +18,7 @@ from meshreg.cli.common import (
     read,
     require_disk,
 )
-from meshreg.cli.console import Progress, Voice, logging_to
+from meshreg.cli.console import Progress, Terminal, logging_to
 from meshreg.cli.guard import Unfinished
 from meshreg.errors import UsageError
 from meshreg.records import Frame, PointCloud
@@ -39,7 +39,7 @@ class ApplyRequest:
     overwrite: bool = False
 
 
-def apply(request: ApplyRequest, voice: Voice, unfinished: Unfinished) -> dict[str, Any]:
+def apply(request: ApplyRequest, voice: Terminal, unfinished: Unfinished) -> dict[str, Any]:
     """Move a further file of the moving survey by a registration that was found."""
     from meshreg.io import require_warpable, require_writable, rewrite_survey, unchanged
     from meshreg.io.files.atomic import as_output_error
@@ -162,7 +162,7 @@ def _meets(bounds: Any, other: Any) -> bool:
     return bool((bounds[0, :2] <= other[1, :2]).all() and (other[0, :2] <= bounds[1, :2]).all())
 
 
-def show_applied(document: dict[str, Any], voice: Voice) -> None:
+def show_applied(document: dict[str, Any], voice: Terminal) -> None:
     """Print what `apply` wrote."""
     for name in document["files"]:
         voice.say(escape(name))

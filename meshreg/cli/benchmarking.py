@@ -11,7 +11,7 @@ from typing import Any
 from rich.markup import escape
 from rich.table import Table
 
-from meshreg.cli.console import Progress, Voice, logging_to
+from meshreg.cli.console import Progress, Terminal, logging_to
 from meshreg.cli.guard import Unfinished
 
 SHOWN = 20  # expectations that do not hold, on the screen; the page has them all
@@ -32,7 +32,7 @@ class BenchmarkRequest:
     overwrite: bool = False
 
 
-def benchmark(request: BenchmarkRequest, voice: Voice, unfinished: Unfinished) -> dict[str, Any]:
+def benchmark(request: BenchmarkRequest, voice: Terminal, unfinished: Unfinished) -> dict[str, Any]:
     """Run the benchmark and return its summary; every pair that is done stays done."""
     from meshreg.benchmark import Options, run_benchmark
 
@@ -56,7 +56,7 @@ def benchmark(request: BenchmarkRequest, voice: Voice, unfinished: Unfinished) -
 class _Counter:
     """Says how many pairs are done: on the bar, or a line a minute where nobody watches."""
 
-    def __init__(self, progress: Progress, voice: Voice, every: float = 60.0) -> None:
+    def __init__(self, progress: Progress, voice: Terminal, every: float = 60.0) -> None:
         self._progress, self._voice, self._every = progress, voice, every
         self._stage, self._began, self._said, self._first = "", 0.0, 0.0, 0
 
@@ -72,7 +72,7 @@ class _Counter:
             self._voice.err.print(f"  {done} of {total}, about {left:.0f} min left")
 
 
-def show(summary: Mapping[str, Any], out: Path, voice: Voice) -> None:
+def show(summary: Mapping[str, Any], out: Path, voice: Terminal) -> None:
     """Print what was found, and what does not hold."""
     from meshreg.benchmark.summary import said
 

@@ -21,6 +21,9 @@ STAGES = {
     "read": "reading",
     "rasterize": "rasterizing",
     "coarse": "searching in coarse cells",
+    "vote": "looking for a turn or a scale",
+    "turn": "turning the moving survey",
+    "internal": "measuring the deformation",
     "sift": "matching image features",
     "terrain": "scanning the terrain",
     "mutual_information": "scanning for mutual information",
@@ -42,7 +45,7 @@ class _Console(Console):
         self.quiet = True
 
 
-class Voice:
+class Terminal:
     """Where a command speaks: tables or one JSON document on stdout, the rest on stderr."""
 
     def __init__(self, as_json: bool = False) -> None:
@@ -103,7 +106,7 @@ def error_document(error: MeshregError) -> dict[str, Any]:
 class Progress:
     """A bar per stage on a terminal, a line per stage elsewhere, nothing under `--json`."""
 
-    def __init__(self, voice: Voice) -> None:
+    def __init__(self, voice: Terminal) -> None:
         from rich import progress as rich_progress
 
         self._voice = voice
@@ -153,7 +156,7 @@ class Progress:
 class _WarningHandler(logging.Handler):
     """Says the library's warnings on stderr, each once."""
 
-    def __init__(self, voice: Voice) -> None:
+    def __init__(self, voice: Terminal) -> None:
         super().__init__(logging.WARNING)
         self._voice = voice
         self._said: set[str] = set()
@@ -176,7 +179,7 @@ class _LogFile(logging.FileHandler):
 
 
 @contextmanager
-def logging_to(voice: Voice, path: Path | None = None) -> Iterator[None]:
+def logging_to(voice: Terminal, path: Path | None = None) -> Iterator[None]:
     """Send warnings to the voice, and everything to the file `path` while the block runs.
 
     Raises

@@ -15,7 +15,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from meshreg.cli.common import NewFolder, SurveyRequest, new_folder
-from meshreg.cli.console import Progress, Voice, logging_to
+from meshreg.cli.console import Progress, Terminal, logging_to
 from meshreg.cli.guard import Unfinished
 from meshreg.cli.registering import RegisterRequest, register, register_into
 from meshreg.settings import Settings
@@ -53,7 +53,7 @@ class Demonstration:
         return tuple(f - t for f, t in zip(self.found, self.true, strict=True))
 
 
-def real(out: Path, overwrite: bool, voice: Voice, unfinished: Unfinished) -> Demonstration:
+def real(out: Path, overwrite: bool, voice: Terminal, unfinished: Unfinished) -> Demonstration:
     """Register the pair of surveys that the package carries."""
     from meshreg.io.options import ReadOptions
 
@@ -65,7 +65,7 @@ def real(out: Path, overwrite: bool, voice: Voice, unfinished: Unfinished) -> De
     return Demonstration(register(request, voice, unfinished))
 
 
-def made(out: Path, overwrite: bool, voice: Voice, unfinished: Unfinished) -> Demonstration:
+def made(out: Path, overwrite: bool, voice: Terminal, unfinished: Unfinished) -> Demonstration:
     """Make two surveys of a reef in OUT/surveys, register them in OUT, compare with the truth."""
     from data_synth.make import write_pair
     from data_synth.recipe import load
@@ -101,7 +101,7 @@ def compared(registration: Registration, truth: Mapping[str, Any]) -> Demonstrat
     return Demonstration(registration, true, found)
 
 
-def introduce(real_pair: bool, voice: Voice) -> None:
+def introduce(real_pair: bool, voice: Terminal) -> None:
     """Say what is going to be registered."""
     if real_pair:
         voice.say("Two drone surveys of one beach, eight months apart; the later one was moved on")
@@ -122,7 +122,7 @@ def document(done: Demonstration) -> dict[str, Any]:
     return registration_document(registration)
 
 
-def show(done: Demonstration, out: Path, voice: Voice) -> None:
+def show(done: Demonstration, out: Path, voice: Terminal) -> None:
     """Print the result, how far it is from the truth, and where the pictures are."""
     from meshreg.cli import result
 

@@ -42,7 +42,7 @@ ForkingPickler.register(MappingProxyType, lambda frozen: (_frozen, (dict(frozen)
 
 
 @contextmanager
-def draughtsman(*surveys: str) -> Iterator[Begin]:
+def figure_worker(*surveys: str) -> Iterator[Begin]:
     """Give what draws the figures of a registration of these surveys' files.
 
     ``begin(registration, folder)`` may start on them elsewhere, and returns what is to be called

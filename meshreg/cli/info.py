@@ -11,7 +11,7 @@ from meshreg.pipeline import level_axes, posture
 from meshreg.records import Float64, Maps, Mesh, PointCloud, Survey
 
 if TYPE_CHECKING:
-    from meshreg.cli.console import Voice
+    from meshreg.cli.console import Terminal
 
 LEVEL = 10.0  # degrees of tilt from which a survey is said not to be level
 _SAMPLE = 500_000
@@ -143,7 +143,7 @@ def remarks(survey: Survey, tilt: float, thin: str) -> list[str]:
     return said
 
 
-def show(document: dict[str, Any], voice: Voice) -> None:
+def show(document: dict[str, Any], voice: Terminal) -> None:
     """Print the description as a table."""
     from rich.markup import escape
     from rich.table import Table

@@ -9,7 +9,7 @@ from typing import Any
 from rich.markup import escape
 from rich.table import Table
 
-from meshreg.cli.console import Voice
+from meshreg.cli.console import Terminal
 from meshreg.doctor import Check
 
 _MARKS = {"ok": "[green]ok[/]", "missing": "[red]MISSING[/]", "optional": "[yellow]absent[/]"}
@@ -20,7 +20,7 @@ def document(checks: Sequence[Check]) -> dict[str, Any]:
     return {"schema": "meshreg.doctor/1", "checks": [dataclasses.asdict(c) for c in checks]}
 
 
-def show(checks: Sequence[Check], voice: Voice) -> None:
+def show(checks: Sequence[Check], voice: Terminal) -> None:
     """Print what is there, what is not, and the commands that bring it."""
     table = Table(box=None, pad_edge=False)
     for column in ("", "what", "for", "found"):

@@ -9,7 +9,7 @@ from typing import Any
 
 from rich.markup import escape
 
-from meshreg.cli.console import Progress, Voice
+from meshreg.cli.console import Progress, Terminal
 from meshreg.errors import UsageError
 
 
@@ -37,7 +37,7 @@ def parse_changes(changes: Sequence[str] | None) -> dict[str, str]:
     return found
 
 
-def synth(request: SynthRequest, voice: Voice) -> dict[str, Any]:
+def synth(request: SynthRequest, voice: Terminal) -> dict[str, Any]:
     """Make the pair and its truth; say where they are and what the truth is."""
     import json
 
@@ -66,7 +66,7 @@ def synth(request: SynthRequest, voice: Voice) -> dict[str, Any]:
     }
 
 
-def show(document: Mapping[str, Any], voice: Voice) -> None:
+def show(document: Mapping[str, Any], voice: Terminal) -> None:
     """Print what was made."""
     names = ", ".join(Path(file).name for file in document["files"][:12])
     more = len(document["files"]) - 12

@@ -18,7 +18,7 @@ from meshreg.cli.common import (
     read_masks,
     require_disk,
 )
-from meshreg.cli.console import Progress, Voice, logging_to
+from meshreg.cli.console import Progress, Terminal, logging_to
 from meshreg.cli.guard import Unfinished
 from meshreg.settings import Settings
 
@@ -35,7 +35,7 @@ class RasterizeRequest:
     config: Path | None = None
 
 
-def rasterize(request: RasterizeRequest, voice: Voice, unfinished: Unfinished) -> dict[str, Any]:
+def rasterize(request: RasterizeRequest, voice: Terminal, unfinished: Unfinished) -> dict[str, Any]:
     """Write dem.tif and ortho.tif of one survey; say what they are."""
     from meshreg.io.maps.pair import local_crs, write_raster
     from meshreg.io.result.manifest import require_apart, survey_files
@@ -88,7 +88,7 @@ def rasterize(request: RasterizeRequest, voice: Voice, unfinished: Unfinished) -
     }
 
 
-def show_maps(document: dict[str, Any], voice: Voice) -> None:
+def show_maps(document: dict[str, Any], voice: Terminal) -> None:
     """Print what `rasterize` wrote."""
     for one in document["maps"].values():
         size = f"{one['rows']} × {one['columns']} cells of {one['cell']:g} m"

@@ -17,13 +17,13 @@ from rich.markup import escape
 
 from meshreg.cli import pairing
 from meshreg.cli.common import LOG, SurveyRequest, read
-from meshreg.cli.console import Progress, Voice, logging_to
+from meshreg.cli.console import Progress, Terminal, logging_to
 from meshreg.cli.guard import StoppedError, Unfinished, run_stoppable
 from meshreg.errors import UsageError
 from meshreg.settings import Settings
 
 if TYPE_CHECKING:
-    from meshreg.ties.desk import Desk
+    from meshreg.ties.state import PickState
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ def _removed_in_any_case(folder: str) -> Iterator[None]:
         waiting.wait()
 
 
-def pick(request: PickRequest, voice: Voice) -> None:
+def pick(request: PickRequest, voice: Terminal) -> None:
     """Show the page until Ctrl-C; every pair is in the file before the page says so."""
     from meshreg.ties.server import PickServer
     from meshreg.ties.session import only_one
@@ -75,7 +75,7 @@ def pick(request: PickRequest, voice: Voice) -> None:
         only_one(request.ties),
     ):
 
-        def job(unfinished: Unfinished) -> Desk:
+        def job(unfinished: Unfinished) -> PickState:
             with unfinished.holding(Path(folder)):
                 return _desk(request, Path(folder), voice)
 
@@ -93,19 +93,19 @@ def pick(request: PickRequest, voice: Voice) -> None:
         raise stopped
 
 
-def _desk(request: PickRequest, folder: Path, voice: Voice) -> Desk:
+def _desk(request: PickRequest, folder: Path, voice: Terminal) -> PickState:
     with logging_to(voice), Progress(voice) as progress:
         if request.moving is None:
             return _desk_of_result(request, folder)
         return _desk_of_surveys(request, request.moving, folder, progress)
 
 
-def _desk_of_result(request: PickRequest, folder: Path) -> Desk:
+def _desk_of_result(request: PickRequest, folder: Path) -> PickState:
     """Lay out a result's own pictures: the moving one is of the registered survey."""
-    from meshreg.ties.desk import Desk
     from meshreg.ties.pictures import write_relief
     from meshreg.ties.placing import read_placing
     from meshreg.ties.session import Session
+    from meshreg.ties.state import PickState
     from meshreg.ties.tiles import TileSource
 
     out = Path(request.reference.path)
@@ -127,18 +127,20 @@ def _desk_of_result(request: PickRequest, folder: Path) -> Desk:
     names = (record.reference.get("name") or "reference", record.moving.get("name") or "moving")
     session = Session(request.ties, record.reference.get("crs"))
     settings = request.settings.sift
-    return Desk(sources[0], sources[1], names, session, placing, registered=True, settings=settings)
+    return PickState(
+        sources[0], sources[1], names, session, placing, registered=True, settings=settings
+    )
 
 
 def _desk_of_surveys(
     request: PickRequest, moving_request: SurveyRequest, folder: Path, progress: Progress
-) -> Desk:
+) -> PickState:
     from meshreg.io.frames.place import common_crs
     from meshreg.raster.grid import choose_cells
-    from meshreg.ties.desk import Desk
     from meshreg.ties.pictures import write_picture
     from meshreg.ties.placing import read_placing
     from meshreg.ties.session import Session
+    from meshreg.ties.state import PickState
     from meshreg.ties.tiles import TileSource
 
     placing = None if request.registration is None else read_placing(request.registration)
@@ -167,10 +169,12 @@ def _desk_of_surveys(
         sources.append(TileSource(path))
     progress("rasterize", 1.0)
     names = (reference.name, moving.name)
-    return Desk(sources[0], sources[1], names, session, placing, settings=request.settings.sift)
+    return PickState(
+        sources[0], sources[1], names, session, placing, settings=request.settings.sift
+    )
 
 
-def _announce(url: str, request: PickRequest, voice: Voice) -> None:
+def _announce(url: str, request: PickRequest, voice: Terminal) -> None:
     if voice.as_json:
         voice.document({"schema": "meshreg.pick/1", "url": url, "ties": str(request.ties)})
         return
@@ -181,7 +185,7 @@ def _announce(url: str, request: PickRequest, voice: Voice) -> None:
     voice.say("Ctrl-C ends it.")
 
 
-def _say_end(desk: Desk, voice: Voice) -> None:
+def _say_end(desk: PickState, voice: Terminal) -> None:
     from meshreg.ties.hand import free_hand
 
     ties = desk.session.ties

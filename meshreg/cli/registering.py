@@ -21,8 +21,8 @@ from meshreg.cli.common import (
     read_masks,
     require_disk,
 )
-from meshreg.cli.console import Progress, Voice, logging_to
-from meshreg.cli.drawing import draughtsman
+from meshreg.cli.console import Progress, Terminal, logging_to
+from meshreg.cli.drawing import figure_worker
 from meshreg.cli.guard import Unfinished
 from meshreg.cli.reporting import add_report
 from meshreg.cli.validating import read_manual
@@ -53,7 +53,7 @@ def _new(request: RegisterRequest) -> NewFolder:
     return NewFolder(request.out, request.overwrite, "register", "registration.json", inputs)
 
 
-def register(request: RegisterRequest, voice: Voice, unfinished: Unfinished) -> Registration:
+def register(request: RegisterRequest, voice: Terminal, unfinished: Unfinished) -> Registration:
     """Run the main job: read, register, write OUT whole."""
     with (
         new_folder(_new(request), unfinished) as folder,
@@ -72,7 +72,7 @@ def register_into(folder: Path, request: RegisterRequest, progress: Progress) ->
 
     _log_start(request)
     with (
-        draughtsman(request.reference.path, request.moving.path) as begin,
+        figure_worker(request.reference.path, request.moving.path) as begin,
         ThreadPoolExecutor(1) as beside,
     ):
         clock = time.perf_counter()

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from rich.markup import escape
 
 from meshreg.cli.common import LOG, in_place
-from meshreg.cli.console import Voice
+from meshreg.cli.console import Terminal
 from meshreg.errors import InputError, MeshregError
 
 if TYPE_CHECKING:
@@ -126,7 +126,7 @@ def document(page: Path) -> dict[str, Any]:
     return {"schema": "meshreg.report/1", "report": str(page), "bytes": page.stat().st_size}
 
 
-def show(page: Path, voice: Voice) -> None:
+def show(page: Path, voice: Terminal) -> None:
     """Say where the page is."""
     size = page.stat().st_size / 1e6
     voice.say(f"Written: [bold]{escape(str(page))}[/] ({size:.1f} MB). Open it in a browser.")

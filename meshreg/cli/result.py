@@ -10,7 +10,7 @@ from rich.markup import escape
 from rich.panel import Panel
 from rich.table import Table
 
-from meshreg.cli.console import Voice
+from meshreg.cli.console import Terminal
 from meshreg.records import OffsetEstimate, Registration
 from meshreg.report.words import next_steps
 
@@ -19,7 +19,7 @@ _STATUS_COLORS = {"ok": "green", "weak": "yellow", "failed": "red"}
 _DASH = "–"
 
 
-def show(registration: Registration, out: Path, voice: Voice) -> None:
+def show(registration: Registration, out: Path, voice: Terminal) -> None:
     """Print the verdict, the offset, each method's answer, and where the files are."""
     color = _COLORS[registration.verdict]
     reason = registration.reason.strip()
@@ -41,7 +41,7 @@ def show(registration: Registration, out: Path, voice: Voice) -> None:
         voice.say(f"[yellow]next:[/] {escape(step)}")
 
 
-def _print_offset(registration: Registration, voice: Voice) -> None:
+def _print_offset(registration: Registration, voice: Terminal) -> None:
     transform, covariance = registration.transform, registration.covariance
     assert transform is not None
     sigmas: list[float] = [math.nan] * 7

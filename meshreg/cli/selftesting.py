@@ -22,7 +22,7 @@ from meshreg.cli.common import (
     read,
     read_masks,
 )
-from meshreg.cli.console import Progress, Voice, logging_to
+from meshreg.cli.console import Progress, Terminal, logging_to
 from meshreg.cli.guard import Unfinished
 from meshreg.settings import Settings
 
@@ -44,7 +44,7 @@ class SelftestRequest:
     allow_same: bool = False
 
 
-def selftest(request: SelftestRequest, voice: Voice, unfinished: Unfinished) -> dict[str, Any]:
+def selftest(request: SelftestRequest, voice: Terminal, unfinished: Unfinished) -> dict[str, Any]:
     """Read both surveys, put known shifts into the moving one, say what came back."""
     with _folder(request, unfinished) as folder:
         log = None if folder is None else folder / "log.txt"
@@ -103,7 +103,7 @@ def _tested(request: SelftestRequest, progress: Progress) -> dict[str, Any]:
     return result.document()
 
 
-def show(document: dict[str, Any], voice: Voice) -> None:
+def show(document: dict[str, Any], voice: Terminal) -> None:
     """Print a line per trial, their rms, and what this plot can resolve."""
     color = {"accepted": "green", "review": "yellow", "rejected": "red"}[document["verdict"]]
     verdict = f"[bold {color}]{document['verdict'].upper()}[/]"

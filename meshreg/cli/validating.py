@@ -13,7 +13,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from meshreg.cli.common import LOG, in_place
-from meshreg.cli.console import Voice
+from meshreg.cli.console import Terminal
 from meshreg.errors import InputError, OutputError, UsageError
 
 if TYPE_CHECKING:
@@ -53,7 +53,9 @@ def validate(request: ValidateRequest) -> dict[str, Any]:
         raise UsageError(f"--radius is {request.radius}; it must be over 0 and at most 1000 m.")
     if not request.out.is_dir():
         raise UsageError(
-            "is no folder.", file=request.out, remedy="Give the one that `meshreg register` wrote."
+            "is not a folder.",
+            file=request.out,
+            remedy="Give the one that `meshreg register` wrote.",
         )
     require_ours(request.out, (*PAGES, "report.html"))
     registration = read_registration(request.out)
@@ -227,7 +229,7 @@ def _png(figure: Any) -> bytes:
     return stream.getvalue()
 
 
-def show(document: dict[str, Any], out: Path, voice: Voice) -> None:
+def show(document: dict[str, Any], out: Path, voice: Terminal) -> None:
     """Print the hand registration, and each answer's distance from it."""
     from meshreg.report.style import method_name
 

@@ -5,7 +5,7 @@ it has not seen is as good as any other's is kept.
 """
 
 from meshreg.deformation.internal import (
-    Internal,
+    Deformation,
     check_model,
     measure,
 )
@@ -14,7 +14,7 @@ from meshreg.deformation.warp_rasters import (
 )
 
 __all__ = [
-    "Internal",
+    "Deformation",
     "check_model",
     "measure",
     "warped_raster",

@@ -1,7 +1,7 @@
 """The internal error: how the two models bend against each other once a rigid move has laid them.
 
 Measured for every pair, from the offsets of tiles (`refine.tiles`) and the heights of tiles, and
-named in words. The bend that predicts held-out tiles best (`ladder`) can be applied as a
+named in words. The bend that predicts held-out tiles best (`models`) can be applied as a
 `Warp`: after the transform, at the place where the transform has put a point.
 """
 
@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from meshreg.deformation.ladder import MODELS, Sample, Step, choose, climb
+from meshreg.deformation.models import MODELS, Sample, Step, choose, fit_models
 from meshreg.deformation.warp_rasters import LEAST_TILES, height_tiles
 from meshreg.errors import UsageError
 from meshreg.records import Float64, SurveyRaster, Transform, Warp
@@ -26,12 +26,12 @@ _MANY = 0.1  # of the tiles: worth saying
 
 
 @dataclass(frozen=True, eq=False)
-class Internal:
+class Deformation:
     """The internal error of a pair.
 
     Attributes
     ----------
-    said : str
+    summary : str
         In words.
     record : mapping
         For the document: models, tiles, held-out errors, amplitudes, strains.
@@ -42,22 +42,22 @@ class Internal:
         what the named model says there (`model_east`, `model_north`), weights; the same of heights.
     """
 
-    said: str
+    summary: str
     record: Mapping[str, Any] = field(default_factory=dict)
     warp: Warp | None = None
     evidence: Mapping[str, Any] = field(default_factory=dict)
 
-    def applied(self) -> Internal:
+    def applied(self) -> Deformation:
         """Return the same, saying that its warp was applied."""
         assert self.warp is not None
         models = (("horizontally", self.warp.horizontal), ("in height", self.warp.vertical))
         parts = [f"{where} by the {model} model" for where, model in models if model != "rigid"]
         names = " and ".join(parts)
         said = (
-            f"{self.said}; the registered survey is warped ({names}), which transform.txt, the "
+            f"{self.summary}; the registered survey is warped ({names}), which transform.txt, the "
             "rigid part alone, does not say"
         )
-        return dataclasses.replace(self, said=said, record={**self.record, "applied": True})
+        return dataclasses.replace(self, summary=said, record={**self.record, "applied": True})
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +71,7 @@ class _Part:
 
     @classmethod
     def of(cls, sample: Sample, options: WarpSettings) -> _Part:
-        steps = climb(sample)
+        steps = fit_models(sample)
         asked = steps
         if options.model not in ("none", "auto"):
             asked = tuple(s for s in steps if s.model in ("rigid", options.model))
@@ -96,7 +96,7 @@ def measure(
     reference: SurveyRaster,
     moving: SurveyRaster,
     options: WarpSettings,
-) -> Internal:
+) -> Deformation:
     """Measure the internal error of a pair that a transform has laid down.
 
     Parameters
@@ -111,11 +111,11 @@ def measure(
 
     Returns
     -------
-    Internal
+    Deformation
     """
     check_model(options.model)
     if tiles is None or len(np.unique(tiles.block)) < LEAST_TILES:
-        return Internal("the internal error is not known: too few tiles match on their own")
+        return Deformation("the internal error is not known: too few tiles match on their own")
     places, left = _left_over(tiles, transform, moving)
     side = _tile_side(places, tiles.channel)
     low, high = places.min(axis=0) - 0.5 * side, places.max(axis=0) + 0.5 * side
@@ -179,7 +179,7 @@ def _warp(flat: Step | None, up: Step | None, sample: Sample) -> Warp:
     return Warp(names[0], names[1], sample.low, sample.high, table)
 
 
-def _told(flat: _Part, up: _Part | None, options: WarpSettings) -> Internal:
+def _told(flat: _Part, up: _Part | None, options: WarpSettings) -> Deformation:
     named = _warp(flat.named, None if up is None else up.named, flat.sample)
     allowed = _warp(flat.allowed, None if up is None else up.allowed, flat.sample)
     parts = {"horizontal": _part_record(flat, named)}
@@ -211,7 +211,7 @@ def _told(flat: _Part, up: _Part | None, options: WarpSettings) -> Internal:
     bent = (allowed.horizontal, allowed.vertical) != ("rigid", "rigid")
     record: dict[str, Any] = {"said": said, "applied": False, "horizontal": None, "vertical": None}
     evidence = _tile_evidence(said, named, flat, up)
-    return Internal(said, record | parts, allowed if bent else None, evidence)
+    return Deformation(said, record | parts, allowed if bent else None, evidence)
 
 
 def _part_record(part: _Part, warp: Warp) -> dict[str, Any]:

@@ -276,7 +276,7 @@ def require_pages_near(path: Path, uv: NDArray[np.float32]) -> None:
     ------
     InputError
     """
-    with np.errstate(invalid="ignore"):  # those that are no numbers count as none
+    with np.errstate(invalid="ignore"):  # those that are not numbers count as none
         far: Bool = np.asarray((np.abs(uv) >= FARTHEST_PAGE).any(axis=1) & _rows(np.isfinite(uv)))
     count = int(np.count_nonzero(far))
     if count > _MOST_LOST * len(far):

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from meshreg.deformation import Internal, measure, warped_raster
+from meshreg.deformation import Deformation, measure, warped_raster
 from meshreg.heading import Pairs
 from meshreg.height import STABLE
 from meshreg.judge import Found
@@ -84,11 +84,11 @@ def bent(
     transform: Transform | None,
     rasters: Mapping[str, Any],
     settings: Settings,
-) -> tuple[Internal, dict[str, Any]]:
+) -> tuple[Deformation, dict[str, Any]]:
     """Measure how the models bend; where a warp is asked for and found, bend the moving maps."""
     rasters = dict(rasters)
     if refined is None or transform is None:
-        return Internal(""), rasters
+        return Deformation(""), rasters
     dems = rasters["reference_dem"], rasters["moving_dem"]
     internal = measure(refined.tiles, transform, *dems, settings.warp)
     if internal.warp is not None and settings.warp.model != "none":

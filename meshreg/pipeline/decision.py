@@ -40,7 +40,7 @@ from meshreg.pipeline.narrowing import (
     narrowing,
     places,
 )
-from meshreg.pipeline.turned import as_delivered, on_heading_and_scale
+from meshreg.pipeline.turned import as_delivered, check_heading_and_scale
 from meshreg.records import (
     Float64,
     Grid,
@@ -344,7 +344,7 @@ def _in_frame(
                 refined, scale = as_delivered(refined, motion), scale * motion.scale
             horizontal = _horizontal(refined, scale)
             heights = fit_heights(*first["dem"], horizontal, refined.offset_at)
-        scaled, notes = on_heading_and_scale(refined.yaw, scale, settings.search, turn, motion)
+        scaled, notes = check_heading_and_scale(refined.yaw, scale, settings.search, turn, motion)
         found = Found(
             turned=refined.doubt,
             tilted=heights.doubt,

@@ -54,7 +54,7 @@ def pair_grids(
     return {name: (still[name], moved[name]) for name in cells}
 
 
-def lay_down(
+def rasterize_registered(
     moving: Survey,
     transform: Transform | None,
     settings: Settings,

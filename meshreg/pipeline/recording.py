@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from meshreg import judge as judging
-from meshreg.deformation import Internal
+from meshreg.deformation import Deformation
 from meshreg.heading import Pairs
 from meshreg.height import Heights, stable_ground
 from meshreg.judge import Judgement
@@ -37,7 +37,7 @@ def registration_of(
     decision: Decision,
     answer: Answer,
     judgement: Judgement,
-    laid: tuple[Internal, Mapping[str, Any]],
+    laid: tuple[Deformation, Mapping[str, Any]],
     delivered: Pairs,
     seconds: Mapping[str, float],
 ) -> Registration:

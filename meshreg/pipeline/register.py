@@ -19,7 +19,7 @@ from meshreg.pipeline.answer import answer_of, bent
 from meshreg.pipeline.checks import in_no_metres, prepared, require_different, surveys_apart
 from meshreg.pipeline.decision import Clock, Manual, Progress, decide
 from meshreg.pipeline.explaining import looked_over
-from meshreg.pipeline.levels import lay_down, rasterize_pair
+from meshreg.pipeline.levels import rasterize_pair, rasterize_registered
 from meshreg.pipeline.recording import registration_of, unlike
 from meshreg.records import Registration, Survey, Transform
 from meshreg.settings import Settings
@@ -98,14 +98,14 @@ def register_pair(  # noqa: PLR0913
     if settled is not None and transform is not None and settings.warp.model == "none":
         settled(transform)
     with clock.stage("apply"):
-        rasters = lay_down(moving, transform, settings, masks, pairs)
+        rasters = rasterize_registered(moving, transform, settings, masks, pairs)
     with clock.stage("internal"):
         laid = bent(decision.refined, transform, rasters, settings)
     found, counted = looked_over(
         answer.found, reference, moving, transform, decision, settings, radius, pairs
     )
     judgement = last_word(decision.placed, findings(found))
-    bend = [laid[0].said] if laid[0].said else []
+    bend = [laid[0].summary] if laid[0].summary else []
     notes += [*answer.notes, *bend, *counted]
     answer = dataclasses.replace(answer, found=found, notes=notes)
     both = reference, moving

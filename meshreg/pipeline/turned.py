@@ -13,7 +13,7 @@ from meshreg.refine import Refined
 from meshreg.settings import SearchSettings
 
 
-def on_heading_and_scale(
+def check_heading_and_scale(
     yaw: float,
     scale: float,
     settings: SearchSettings,
@@ -41,7 +41,7 @@ def on_heading_and_scale(
     elif turn is not None and turn.mimics_scale:
         notes += (
             f"the moving survey seems {_missized(turn.stretch)}, which internal distortion "
-            "can feign; its scale was left as it is",
+            "can mimic; its scale was left as it is",
         )
     return scaled, notes
 

@@ -77,7 +77,7 @@ def _holding(bounds: Float64, cell: float, lattice: float | None, crs: str | Non
     times = round(lattice / cell) if cell > 0 else 0
     if not (times >= 1 and abs(times * cell - lattice) <= 1e-9 * lattice):
         raise UsageError(
-            f"The lattice of {lattice} m is no multiple of the cell of {cell} m.",
+            f"The lattice of {lattice} m is not a multiple of the cell of {cell} m.",
             remedy="Give a positive cell, and a lattice that it divides.",
         )
     low, high = bounds / lattice

@@ -162,7 +162,7 @@ def _of_peaks(
     kept = tiles.only(_explained(tiles, rough))
     if not _enough(kept):
         return None
-    return _stated(over_ground(kept, ground, rough.pivot), resolution)
+    return _stated(fit_overlap(kept, ground, rough.pivot), resolution)
 
 
 def _explained(tiles: TileOffsets, rough: Refined) -> Bool:
@@ -246,7 +246,7 @@ def _between(
     apart *= np.sqrt(1.0 - np.array([chance, chance, of_yaw]))
     covariance = covariance + weights.prod() * np.outer(apart, apart)
     surer = first if weights[0] >= weights[1] else second
-    if surer.yaw == 0 and abs(answer[2]) <= 2 * np.sqrt(covariance[2, 2]):  # as `over_ground`
+    if surer.yaw == 0 and abs(answer[2]) <= 2 * np.sqrt(covariance[2, 2]):  # as `fit_overlap`
         answer[2] = 0.0
         covariance = _block_diagonal(covariance[:2, :2], covariance[2, 2])
     assert surer.offset_at is not None
@@ -289,7 +289,7 @@ def _polished(
         if not _enough(tiles):
             return None
         assert tiles is not None
-        answer = over_ground(tiles, ground, start.pivot)
+        answer = fit_overlap(tiles, ground, start.pivot)
         assert answer.offset_at is not None
         guess = answer.offset_at
         step, offset = np.hypot(*(answer.offset - offset)), answer.offset
@@ -298,7 +298,7 @@ def _polished(
     return answer
 
 
-def over_ground(tiles: TileOffsets, ground: Ground, pivot: Float64) -> Refined:
+def fit_overlap(tiles: TileOffsets, ground: Ground, pivot: Float64) -> Refined:
     """Rigid motion that fits the whole ground best; the yaw is 0 where it is under two sigmas.
 
     The ground counts as the reference sees it: where the models stretch, so do its cells. It might

@@ -192,8 +192,8 @@ def residuals(field: Any, bounds: Sequence[float], relief: Any) -> tuple[str, st
         measured += arrow if keep else _cross(px, py)
     caption = (
         f"Offsets left in {int(used.sum())} of {used.size} tiles, weighted rms "
-        f"{1000 * rms:.1f} mm; arrows are drawn {stretch:,.0f} times too long, paler with less "
-        "weight. Crosses: tiles set aside as outliers."
+        f"{1000 * rms:.1f} mm; arrows are exaggerated {stretch:,.0f} times, paler with less "
+        "weight. Crosses: outliers."
     )
     if modelled:
         caption += " Broad and pale: what the named model says there."

@@ -164,7 +164,7 @@ def _scores(kept: Mapping[str, Any], method: str, about: Mapping[str, Any]) -> s
     name = style.method_name(method)
     plot = charts.scores(kept[f"surface_{method}"], about, name)
     better = "low" if about.get("lower_is_better") else "high"
-    said = f"Bright is good; of this measure {better} values are."
+    said = f"Brighter is better: the {better}er the value, the better the fit."
     whole = m.figure(f"<h3>Score of each offset: {say(name)}</h3>{plot}", said)
     near = ""
     if f"near_{method}" in kept and about.get("near"):

@@ -73,7 +73,7 @@ def draw_section(registration: Registration) -> Any:
 
 
 def draw_orthos(registration: Registration) -> Any:
-    """Draw the orthomosaics on each other before and after, and as a chequerboard."""
+    """Draw the orthomosaics on each other before and after, and as a checkerboard."""
     evidence = registration.evidence
     stages = _stages(registration, "moving_ortho")
     reference: SurveyRaster | None = evidence.get("reference_ortho")
@@ -101,9 +101,9 @@ def draw_orthos(registration: Registration) -> Any:
         place.label(axes, inner=index > 0)
     axes = figure.add_subplot(1, columns, columns)
     moved, _ = style.reduced_color(stages[-1][1])
-    board = _chequerboard(color, moved)
+    board = _checkerboard(color, moved)
     axes.imshow(style.over_white(board), extent=place.extent(grid), interpolation="nearest")
-    axes.set_title(f"fields by turns from each survey, {stages[-1][0]}", fontsize=10)
+    axes.set_title(f"checkerboard of both surveys, {stages[-1][0]}", fontsize=10)
     place.label(axes, inner=True)
     return figure
 
@@ -168,7 +168,7 @@ def _profile(axes: Any, north: Any, raster: SurveyRaster, column: int, **look: A
     axes.plot(north, height, **look)
 
 
-def _chequerboard(reference: Any, moving: Any, fields: int = 8) -> Any:
+def _checkerboard(reference: Any, moving: Any, fields: int = 8) -> Any:
     rows, cols = reference.shape[:2]
     side = max(1, round(max(rows, cols) / fields))
     row, col = np.mgrid[:rows, :cols] // side

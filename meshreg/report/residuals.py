@@ -52,7 +52,7 @@ def draw_residuals(registration: Registration) -> Any:
     said = textwrap.fill(str(field.get("said", "")), 110 if heights else 75)
     figure.supxlabel(
         f"{used.sum()} of {used.size} tiles, weighted rms {rms * 1000:.1f} mm; "
-        f"arrows drawn {stretch:,.0f}× too long; crosses: set aside as outliers"
+        f"arrows exaggerated {stretch:,.0f} times; crosses: outliers"
         + (f"\n{said}" if said else ""),
         fontsize=9,
         color="#555555",

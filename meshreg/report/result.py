@@ -11,7 +11,7 @@ from typing import Any
 from meshreg.records import Registration
 
 PAGE = "report.html"
-MANIFEST = "manifest.json"  # keeps the sums of the page too, so that it is no part of it
+MANIFEST = "manifest.json"  # keeps the sums of the page too, so that it is not a part of it
 
 
 @dataclass(frozen=True)

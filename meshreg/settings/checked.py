@@ -298,11 +298,11 @@ def read_toml(path: Path, what: str, error: type[MeshregError] = UsageError) -> 
 
 def _small_text(path: Path) -> str:
     if not stat.S_ISREG(os.stat(path).st_mode):  # before opening, which some devices act upon
-        raise ValueError("it is no regular file")
+        raise ValueError("it is not a regular file")
     handle = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
     with os.fdopen(handle, "rb") as stream:
         if not stat.S_ISREG(os.fstat(handle).st_mode):
-            raise ValueError("it is no regular file")
+            raise ValueError("it is not a regular file")
         content = stream.read(MAX_TOML + 1)
     if len(content) > MAX_TOML:
         raise ValueError(f"it is larger than {MAX_TOML} bytes")

@@ -217,7 +217,7 @@ class WarpSettings(Checked):
 class Settings(Checked):
     """All stages together."""
 
-    preset: Preset = choice("robust", "sturdier methods, or exactly as published", PRESETS)
+    preset: Preset = choice("robust", "more robust methods, or exactly as published", PRESETS)
     methods: tuple[str, ...] = choice(METHODS, "that look for the offset", METHODS)
     seed: int = number(0, "of every random draw", low=0, high=2**31 - 1)
     raster: RasterSettings = field(default_factory=RasterSettings)

@@ -8,8 +8,8 @@ from meshreg.statistics.covariance import (
 from meshreg.statistics.held_out import (
     RAYLEIGH,
     groups_of,
+    least_trimmed_squares,
     robust,
-    steadiest,
 )
 from meshreg.statistics.kriging import (
     Ground,
@@ -33,11 +33,11 @@ __all__ = [
     "block_sandwich",
     "design",
     "groups_of",
+    "least_trimmed_squares",
     "lever",
     "nmad",
     "overlap_ground",
     "registration_error",
     "registration_sigma",
     "robust",
-    "steadiest",
 ]

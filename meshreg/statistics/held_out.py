@@ -68,7 +68,7 @@ def robust(
     return answer, np.linalg.norm(held, axis=1), weights
 
 
-def steadiest(design: Float64, values: Float64, starts: int = 300) -> Float64:
+def least_trimmed_squares(design: Float64, values: Float64, starts: int = 300) -> Float64:
     """Answer (p,) that fits one half of the values best, whatever the other half says.
 
     Least trimmed squares from random starts by concentration steps (Rousseeuw & Van Driessen,

@@ -12,9 +12,9 @@ from typing import Any
 
 from meshreg.errors import MeshregError, OutputError
 from meshreg.io.files.checked_json import parse_json
-from meshreg.ties.desk import Desk
 from meshreg.ties.guard import Guard
 from meshreg.ties.session import StaleError
+from meshreg.ties.state import PickState
 
 ASSETS = Path(__file__).parent / "assets"
 HOST = "127.0.0.1"
@@ -72,7 +72,7 @@ class PickServer:
 
     Parameters
     ----------
-    desk : Desk
+    desk : PickState
     port : int
         0 takes a free one.
 
@@ -82,7 +82,7 @@ class PickServer:
         With the token, for one use.
     """
 
-    def __init__(self, desk: Desk, port: int = 0) -> None:
+    def __init__(self, desk: PickState, port: int = 0) -> None:
         import uvicorn
 
         self.desk = desk
@@ -131,12 +131,12 @@ class PickServer:
         self._server.should_exit = True
 
 
-def make_app(desk: Desk, pool: ThreadPoolExecutor) -> Any:
+def make_app(desk: PickState, pool: ThreadPoolExecutor) -> Any:
     """Return the ASGI application, without its guard.
 
     Parameters
     ----------
-    desk : Desk
+    desk : PickState
     pool : ThreadPoolExecutor
         For what reads files or computes.
     """

@@ -262,6 +262,6 @@ def as_place(values: Mapping[str, Any]) -> Point:
     if not all(isinstance(v, int | float) and not isinstance(v, bool) for v in point):
         raise UsageError(f"A point is two numbers, not {point}.")
     if not all(abs(v) < 1e9 for v in point):  # type: ignore[arg-type]
-        raise UsageError("A point so far out is no place on earth.")
+        raise UsageError("A point so far out is not a place on earth.")
     east, north = (round(float(v), 4) for v in point)  # type: ignore[arg-type]
     return east, north

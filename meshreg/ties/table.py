@@ -134,7 +134,9 @@ def number(path: Path, line: int, text: str, what: str) -> float:
         value = float("nan")
     if not abs(value) < 1e9:
         raise InputError(
-            f"has {text!r} in its {what}; that is no coordinate.", file=path, place=f"line {line}"
+            f"has {text!r} in its {what}; that is not a coordinate.",
+            file=path,
+            place=f"line {line}",
         )
     return value
 
@@ -184,7 +186,7 @@ def read_text(path: Path, limit: int = MAX_BYTES) -> str:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise InputError(
-            f"is no UTF-8 text ({error.reason}).", file=path, remedy=_EXPORT
+            f"is not UTF-8 text ({error.reason}).", file=path, remedy=_EXPORT
         ) from error
 
 

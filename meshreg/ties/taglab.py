@@ -105,7 +105,7 @@ def read_project(path: Path, context: Context) -> Named:
         RecursionError,
     ) as error:
         raise InputError(
-            f"is no TagLab project with markers ({error}).", file=path, remedy=KNOWN
+            f"is not a TagLab project with markers ({error}).", file=path, remedy=KNOWN
         ) from error
     if max(map(len, sides)) > MAX_PAIRS:
         raise InputError(f"has {len(sides[0])} markers; {MAX_PAIRS} are the limit.", file=path)

@@ -104,7 +104,7 @@ FOREIGN = {
         (out / "reference_dem.tif").unlink(),
         (out / "reference_dem.tif").mkdir(),
     ),
-    "a name that is no UTF-8": lambda out: Path(os.fsdecode(bytes(out) + b"/\xff")).write_text(""),
+    "a name that is not UTF-8": lambda out: Path(os.fsdecode(bytes(out) + b"/\xff")).write_text(""),
 }
 
 

@@ -174,7 +174,7 @@ def other_crs(ring, crs):
             "EPSG:32753",
             {"crs": {"type": "name", "properties": {"name": "urn:ogc:def:crs:EPSG::32753"}}},
         ),
-        (CRS, {}),  # numbers that are no degrees are in the survey's CRS
+        (CRS, {}),  # numbers that are not degrees are in the survey's CRS
         (
             "EPSG:4326",
             {"crs": {"type": "name", "properties": {"name": "urn:ogc:def:crs:OGC:1.3:CRS84"}}},

@@ -908,7 +908,7 @@ def test_texcoord_that_is_no_list_and_colours_of_faces(tmp_path):
     face = [INDICES, ("texcoord", "float"), ("red", "uchar")]
     elements = [("vertex", XYZ, SQUARE), ("face", face, [[[0, 1, 2], 0.5, 9]])]
     path = ply(tmp_path / "a.ply", elements, comments=["TextureFile p.png"])
-    with pytest.raises(InputError, match="'texcoord' that is no list"):
+    with pytest.raises(InputError, match="'texcoord' that is not a list"):
         read(path, ReadOptions())
     survey = read(path, ReadOptions(geometry_only=True))
     assert "Colours of faces are not used" in survey.notes[0]

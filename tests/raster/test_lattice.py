@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-import scipy.spatial  # noqa: F401  (its loading is no part of an example's time)
+import scipy.spatial  # noqa: F401  (its loading is not a part of an example's time)
 from hypothesis import given
 from hypothesis import strategies as st
 from reference_raster import block_mean, draped, moved, sheet

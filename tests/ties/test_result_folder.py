@@ -11,7 +11,7 @@ from made_registration import made_registration
 
 from meshreg.cli import app as cli
 from meshreg.cli.common import SurveyRequest
-from meshreg.cli.console import Voice
+from meshreg.cli.console import Terminal
 from meshreg.cli.picking import PickRequest, _desk
 from meshreg.io.options import ReadOptions
 from meshreg.io.result.record import write_registration
@@ -27,7 +27,7 @@ def out(tmp_path_factory) -> Path:
 
 def desk_of(out: Path, folder: Path):
     request = PickRequest(SurveyRequest(str(out), ReadOptions()), None, folder / "ties.csv")
-    return _desk(request, folder, Voice(as_json=True))
+    return _desk(request, folder, Terminal(as_json=True))
 
 
 def test_a_result_is_picked_on_as_it_was_laid_down(out, tmp_path):

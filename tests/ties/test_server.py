@@ -26,11 +26,11 @@ from meshreg.io.maps.pair import write_raster
 from meshreg.io.result.document import registration_document, to_json
 from meshreg.records import Grid, SurveyRaster
 from meshreg.ties import TiePair, TiePoints, read_ties, write_ties
-from meshreg.ties.desk import Desk, Link
 from meshreg.ties.guard import Guard
 from meshreg.ties.placing import Placing
 from meshreg.ties.server import PickServer, make_app
 from meshreg.ties.session import Session, StaleError, only_one
+from meshreg.ties.state import Link, PickState
 from meshreg.ties.tiles import SIDE, TileSource, overlap_points
 
 PORT = 8123
@@ -63,7 +63,7 @@ def folder(tmp_path_factory):
 @pytest.fixture
 def desk(folder, tmp_path):
     sources = [TileSource(folder / f"{name}.tif") for name in ("reference", "moving")]
-    yield Desk(*sources, ("old", "new"), Session(tmp_path / "ties.csv"))
+    yield PickState(*sources, ("old", "new"), Session(tmp_path / "ties.csv"))
     for source in sources:
         source.close()
 
@@ -433,7 +433,7 @@ def test_points_of_a_registered_picture_go_back_to_the_survey(folder, tmp_path):
     transform = registration.transform
     placing = Placing(registration)
     sources = [TileSource(folder / f"{name}.tif") for name in ("reference", "moving")]
-    desk = Desk(*sources, ("a", "b"), Session(tmp_path / "t.csv"), placing, registered=True)
+    desk = PickState(*sources, ("a", "b"), Session(tmp_path / "t.csv"), placing, registered=True)
     place = transform.pivot + np.array([3.0, -4.0, 0.0])
     shown = transform.apply(place)
     desk.change(0, "point", {"side": "moving", "x": shown[0], "y": shown[1]})

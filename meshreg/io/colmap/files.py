@@ -81,7 +81,7 @@ def find_model(root: Path) -> ModelFiles:
         folder.
     """
     if not root.is_dir():
-        raise InputError("is no folder of a COLMAP model.", file=root, remedy="Name its folder.")
+        raise InputError("is not a folder of a COLMAP model.", file=root, remedy="Name its folder.")
     for place in (root, root / "sparse"):
         if any(_present(place, suffix) for suffix in (".bin", ".txt")):
             return _complete(place, root)

@@ -65,7 +65,7 @@ def read_positions(path: Path) -> Positions:
     with open_regular(path) as stream:
         text = stream.read(_MAX_BYTES + 1)
     if len(text) > _MAX_BYTES or b"\0" in text:
-        raise InputError("is no table of positions.", file=path, remedy=_REMEDY)
+        raise InputError("is not a table of positions.", file=path, remedy=_REMEDY)
     lines = [
         (number, line.strip())
         for number, line in enumerate(text.decode("utf-8-sig", "replace").splitlines(), 1)

@@ -143,7 +143,7 @@ def _parse(xml: bytes, path: Path) -> _Walk:
         ) from error
     except ValueError as error:
         raise InputError(
-            f"has a value in its XML section that is no number: {error}.",
+            f"has a value in its XML section that is not a number: {error}.",
             file=path,
             place=f"line {walk.parser.CurrentLineNumber} of the XML section",
             remedy=AGAIN,
@@ -239,7 +239,7 @@ def _unit(quaternion: Float64, path: Path) -> Float64:
     norm = float(np.linalg.norm(quaternion))
     if not (np.isfinite(norm) and norm > 1e-6):
         raise InputError(
-            f"has a pose whose rotation is {quaternion.tolist()}, which is no rotation.",
+            f"has a pose whose rotation is {quaternion.tolist()}, which is not a rotation.",
             file=path,
             place="XML section",
             remedy=AGAIN,

@@ -24,7 +24,7 @@ def parse_json(text: bytes, file: Path) -> Any:
     """
 
     def refuse(constant: str) -> None:
-        raise InputError(f"holds {constant}, which is no JSON.", file=file)
+        raise InputError(f"holds {constant}, which is not JSON.", file=file)
 
     def whole(digits: str) -> int | float:
         return int(digits) if len(digits) < 19 else math.inf  # refused below, with its place
@@ -34,9 +34,9 @@ def parse_json(text: bytes, file: Path) -> Any:
         place = _too_large(document, "")
     except json.JSONDecodeError as error:
         where = f"line {error.lineno}, column {error.colno}"
-        raise InputError(f"is no JSON: {error.msg}.", file=file, place=where) from error
+        raise InputError(f"is not JSON: {error.msg}.", file=file, place=where) from error
     except (UnicodeDecodeError, RecursionError, ValueError) as error:
-        raise InputError(f"is no JSON text: {error}.", file=file) from error
+        raise InputError(f"is not JSON text: {error}.", file=file) from error
     if place:
         raise InputError(f"has a number over {LARGEST:g}.", file=file, place=place)
     return document

@@ -71,7 +71,7 @@ def line_blocks(stream: BinaryIO, path: Path, hasher: Any = None) -> Iterator[Bl
         size = len(carry) + n_read
         if size and buffer[:size].min() == 0:
             raise InputError(
-                "holds a NUL byte: it is no text, or damaged.",
+                "holds a NUL byte: it is not text, or damaged.",
                 file=path,
                 place=f"byte {place + int(buffer[:size].argmin())}",
                 remedy="Export or copy it again.",

@@ -74,7 +74,7 @@ class Document:
         if kind not in self._checked:
             found = self.tree.get(kind, [])
             if not isinstance(found, list) or not all(isinstance(item, dict) for item in found):
-                self.fail(f"has {kind!r} that is no list of objects.")
+                self.fail(f"has {kind!r} that is not a list of objects.")
             self._checked[kind] = found
         return self._checked[kind]
 
@@ -89,7 +89,7 @@ class Document:
         """Return a whole number, zero or more, from an object."""
         value = owner.get(key, default)
         if type(value) is not int or not 0 <= value < 2**53:
-            self.fail(f"has {key} = {str(value)[:40]}, which is no count.", place)
+            self.fail(f"has {key} = {str(value)[:40]}, which is not a count.", place)
         return value
 
     def numbers(self, owner: dict[str, Any], key: str, count: int, place: str) -> Float64 | None:
@@ -109,7 +109,7 @@ class Document:
             for index, item in enumerate(self.items(kind)):
                 uri = item.get("uri")
                 if uri is not None and not isinstance(uri, str):
-                    self.fail("has a uri that is no text.", f"{kind}[{index}]")
+                    self.fail("has a uri that is not text.", f"{kind}[{index}]")
                 if uri is not None and not uri.startswith("data:"):
                     yield kind, index, uri
 
@@ -126,7 +126,7 @@ class Document:
                 raise ValueError
             return base64.b64decode(text, validate=True)
         except (ValueError, binascii.Error):
-            self.fail("has a data: uri that is no base64.", place)
+            self.fail("has a data: uri that is not base64.", place)
 
     def buffer(self, index: Any, place: str) -> UInt8:
         """Return the bytes of a buffer, at least as many as it declares."""
@@ -278,7 +278,7 @@ def _read_glb(path: Path, data: UInt8) -> Document:
 
 def _parse(path: Path, text: bytes, start: int) -> dict[str, Any]:
     def constant(name: str) -> NoReturn:
-        raise ValueError(f"{name} is no JSON number")
+        raise ValueError(f"{name} is not a JSON number")
 
     try:
         tree = json.loads(text.decode("utf-8-sig"), parse_constant=constant)
@@ -295,14 +295,14 @@ def _parse(path: Path, text: bytes, start: int) -> dict[str, Any]:
             remedy=_DAMAGED,
         ) from error
     if not isinstance(tree, dict):
-        raise InputError("is no glTF: its JSON is no object.", file=path, remedy=_DAMAGED)
+        raise InputError("is not glTF: its JSON is not an object.", file=path, remedy=_DAMAGED)
     return tree
 
 
 def _check_extensions(document: Document) -> None:
     required = document.tree.get("extensionsRequired", [])
     if not isinstance(required, list):
-        document.fail("has extensionsRequired that is no list.")
+        document.fail("has extensionsRequired that is not a list.")
     for name in map(str, required):
         if name in _COMPRESSED:
             document.fail(

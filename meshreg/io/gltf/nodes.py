@@ -36,7 +36,7 @@ def mesh_instances(document: Document) -> list[tuple[int, Float64]]:
         place = f"nodes[{index}]"
         node = document.item("nodes", index, place)
         if index in seen:
-            document.fail("is reached twice: the nodes are no tree.", place)
+            document.fail("is reached twice: the nodes are not a tree.", place)
         seen.add(index)
         if depth > _DEPTH or len(seen) > _MAX_NODES:
             document.fail(f"lies more than {_DEPTH} levels deep.", place)
@@ -48,7 +48,7 @@ def mesh_instances(document: Document) -> list[tuple[int, Float64]]:
             found.append((int(node["mesh"]), matrix))
         children = node.get("children", [])
         if not isinstance(children, list) or len(children) > len(nodes):
-            document.fail("has children that are no list of nodes.", place)
+            document.fail("has children that are not a list of nodes.", place)
         stack += [(child, matrix, depth + 1) for child in reversed(children)]
     return found
 
@@ -67,7 +67,7 @@ def roots_of(document: Document, scene: dict[str, Any]) -> list[int]:
     """Return the root nodes of one scene, checked to be numbers."""
     roots = scene.get("nodes", [])
     if not isinstance(roots, list) or not all(type(root) is int for root in roots):
-        document.fail("has a scene whose nodes are no list of numbers.", "scenes")
+        document.fail("has a scene whose nodes are not a list of numbers.", "scenes")
     return roots
 
 

@@ -110,7 +110,7 @@ def _require_bounded(document: Document, instances: list[tuple[int, Float64]]) -
 def _primitives(document: Document, mesh: int) -> list[dict[str, Any]]:
     found = document.items("meshes")[mesh].get("primitives")
     if not isinstance(found, list) or not all(isinstance(item, dict) for item in found):
-        document.fail("has primitives that are no list of objects.", f"meshes[{mesh}]")
+        document.fail("has primitives that are not a list of objects.", f"meshes[{mesh}]")
     return found
 
 

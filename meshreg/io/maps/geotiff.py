@@ -184,7 +184,7 @@ def _world_file(path: Path) -> Float64:
         a, d, b, e, c, f = (float(word) for word in words[:6])
     except ValueError as error:
         raise InputError(
-            "is no world file: it should hold six numbers.", file=path, remedy=EXPORT
+            "is not a world file: it should hold six numbers.", file=path, remedy=EXPORT
         ) from error
     return np.array([[a, b, c - (a + b) / 2], [d, e, f - (d + e) / 2]])
 

@@ -122,7 +122,7 @@ def _parsed(path: Path) -> ET.Element | None:
         root = ET.fromstring(content)
     except (ET.ParseError, ValueError) as error:
         raise InputError(
-            f"is no XML: {error}.",
+            f"is not XML: {error}.",
             file=path,
             remedy="Remove it, if the GeoTIFF is right without it.",
         ) from error
@@ -154,7 +154,7 @@ def read_mask_file(
     with open_regular(sides.mask) as stream:
         is_tiff = stream.read(4) in MAGIC
     if not is_tiff:  # a VRT in disguise, for one, which names other files
-        notes.append(f"{sides.mask.name} beside it is no TIFF, as GDAL's masks are; ignored.")
+        notes.append(f"{sides.mask.name} beside it is not a TIFF, as GDAL's masks are; ignored.")
         return None
     with opened(sides.mask, shape[0] * shape[1]) as dataset:
         if dataset.shape != shape:

@@ -264,7 +264,7 @@ def _color_factor(dataset: Any, bands: list[int], path: Path, notes: list[str]) 
         full = float(next((2**n - 1 for n in (8, 10, 12, 14, 16) if highest < 2**n), math.nan))
     if math.isnan(full):
         raise InputError(
-            f"holds {dtype} values up to {highest:g}, which are no colours.",
+            f"holds {dtype} values up to {highest:g}, which are not colours.",
             file=path,
             remedy="Export the orthomosaic in 8 or 16 bits a band.",
         )

@@ -70,7 +70,7 @@ def read_geojson(path: Path, target: str | None) -> tuple[tuple[Area, ...], str 
         document = json.loads(text.decode("utf-8-sig"))
         areas = tuple(_geojson_areas(document, {}))
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
-        raise InputError(f"is no GeoJSON: {error}.", file=path, remedy=KINDS) from error
+        raise InputError(f"is not GeoJSON: {error}.", file=path, remedy=KINDS) from error
     named = document.get("crs")
     if named:
         try:
@@ -81,7 +81,7 @@ def read_geojson(path: Path, target: str | None) -> tuple[tuple[Area, ...], str 
         return areas, None
     reach = np.max([np.abs(ring).max(axis=0) for area in areas for ring in area.rings], axis=0)
     if reach[0] > 360 or reach[1] > 90:
-        log.warning("%s: its numbers are no degrees; taken to be in %s.", path, crs_name(target))
+        log.warning("%s: its numbers are not degrees; taken to be in %s.", path, crs_name(target))
         return areas, None
     return areas, crs_text(_LON_LAT)
 

@@ -156,7 +156,7 @@ def read_mask(
         elif head.lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"{"):
             areas, own = read_geojson(path, target)
         else:
-            raise InputError("is no mask that is known.", file=path, remedy=KINDS)
+            raise InputError("is not a mask that is known.", file=path, remedy=KINDS)
         if not areas:
             raise InputError("holds no polygon.", file=path, remedy=KINDS)
         placed = areas

@@ -170,7 +170,7 @@ def _split(start: bytes, path: Path) -> list[bytes]:
 
 def _count(text: str, name: str, path: Path, place: str) -> int:
     if not re.fullmatch(r"[0-9]{1,18}", text):
-        raise _bad(f"declares {text[:40]} of element {name!r}, which is no count", path, place)
+        raise _bad(f"declares {text[:40]} of element {name!r}, which is not a count", path, place)
     return int(text)
 
 
@@ -192,7 +192,9 @@ def _property(
     if len(words) == 2:
         return Property(name, _TYPES[kind], "", line)
     if _TYPES[count] not in ("i1", "u1", "i2", "u2", "i4", "u4"):
-        raise _bad(f"counts the list {name!r} in {count!r}, which is no integer type", path, place)
+        raise _bad(
+            f"counts the list {name!r} in {count!r}, which is not an integer type", path, place
+        )
     return Property(name, _TYPES[kind], _TYPES[count], line)
 
 

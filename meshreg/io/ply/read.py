@@ -197,7 +197,7 @@ def _listed_uv(
     """Read the faces' lists of u, v, u, v...; an empty list is a face without texture."""
     lengths, values = face.column(number)
     if lengths is None:
-        raise InputError("has 'texcoord' that is no list.", file=face.file, remedy=_WITHOUT)
+        raise InputError("has 'texcoord' that is not a list.", file=face.file, remedy=_WITHOUT)
     has = lengths > 0
     wrong = np.flatnonzero(has & (lengths != 2 * sizes))
     if len(wrong):

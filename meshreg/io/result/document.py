@@ -198,7 +198,9 @@ def read_registration(path: str | Path) -> Registration:
     with open_regular(path) as file:
         text = file.read(MAX_BYTES + 1)
     if len(text) > MAX_BYTES:
-        raise InputError(f"is larger than {MAX_BYTES} bytes; that is no registration.", file=path)
+        raise InputError(
+            f"is larger than {MAX_BYTES} bytes; that is not a registration.", file=path
+        )
     return _registration(_parse(text, path), path)
 
 

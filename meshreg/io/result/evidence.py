@@ -69,7 +69,9 @@ def read_evidence(folder: Path) -> dict[str, Any]:
             with zipfile.ZipFile(stream) as archive:
                 size = sum(entry.file_size for entry in archive.infolist())
             if size > _MAX_BYTES:
-                raise InputError(f"unpacks to {size} bytes; that is no evidence.", file=path)
+                raise InputError(
+                    f"unpacks to {size} bytes; that is not the evidence of a result.", file=path
+                )
             stream.seek(0)
             with np.load(stream, allow_pickle=False) as archive:
                 arrays = {name: archive[name] for name in archive.files}
@@ -109,7 +111,7 @@ def _require_array(name: str, array: Any, path: Path) -> None:
     elif array.dtype.kind == "f" and not (np.abs(array[np.isfinite(array)]) <= LARGEST).all():
         why = f"has a number over {LARGEST:g}"
     elif known[1] == "u" and not array[:12].tobytes().startswith(_PICTURES):
-        why = "is no picture"
+        why = "is not a picture"
     if why:
         raise InputError(
             f"has an array that is none: {why}.", file=path, place=name, remedy=_REMEDY

@@ -164,7 +164,7 @@ def require_only_ours(folder: Path, markers: Sequence[str], seen: Seen | None = 
     if not present:
         count = len(os.listdir(folder))
         raise UsageError(
-            f"holds {count} files and folders, but no {' or '.join(markers)}: it is no former "
+            f"holds {count} files and folders, but no {' or '.join(markers)}: it is not a former "
             "result and will not be deleted.",
             file=folder,
             remedy="Choose another folder.",

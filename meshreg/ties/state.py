@@ -54,7 +54,7 @@ class Link:
 
 
 @dataclass(eq=False)
-class Desk:
+class PickState:
     """Everything that the page works on.
 
     Attributes

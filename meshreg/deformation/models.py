@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from meshreg.records import Bool, Float64, Warp, cubic_weights
-from meshreg.statistics import RAYLEIGH, groups_of, robust, steadiest
+from meshreg.statistics import RAYLEIGH, groups_of, least_trimmed_squares, robust
 
 MODELS = ("rigid", "similarity", "dome", "quadratic", "spline")
 FALL = 0.9  # a richer model must bring the held-out error below this share
@@ -70,7 +70,7 @@ class Step:
     strain: float
 
 
-def climb(sample: Sample) -> tuple[Step, ...]:
+def fit_models(sample: Sample) -> tuple[Step, ...]:
     """Fit every model that the sample has tiles enough for; the spline once for each stiffness."""
     steps = []
     for model in MODELS:
@@ -153,7 +153,7 @@ def _fits(sample: Sample, model: str) -> Iterator[Step]:
         return
     sites = _sites(sample, counts or (1, 1))
     design, at_sites = (_polynomials(p, sample, model) for p in (sample.places, sites))
-    start = steadiest(design, sample.values) if model == "rigid" else None
+    start = least_trimmed_squares(design, sample.values) if model == "rigid" else None
     answer, held, weights = robust(design, sample.values, sample.block, sample.channel, start=start)
     table = _through(at_sites @ answer, sites, sample, counts or (1, 1))
     yield _step(model, table, held, weights, sample)
