@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 ROOT = Path(__file__).parent.parent
-sys.path[:0] = [str(ROOT / "scripts" / "stress_parts"), str(ROOT), str(ROOT / "tests")]
+sys.path[:0] = [str(ROOT / "scripts" / "stress_parts"), str(ROOT), str(ROOT / "tests" / "helpers")]
 RADIUS = ("--search-radius", "0.5")
 PAIR = ("reference.obj", "moving.obj")
 MAPS = ("reference_dem.tif,reference_ortho.tif", "moving_dem.tif,moving_ortho.tif")

@@ -179,7 +179,7 @@ def test_open3d_is_imported_in_one_place() -> None:
     assert {
         "meshreg/refine/surfaces.py",
         "scripts/bench_parts/peers.py",
-        "tests/test_surfaces.py",
+        "tests/refine/test_surfaces.py",
     } <= {str(path.relative_to(ROOT)) for path in found}
     importers = [path for path in found if importing.search(path.read_text(encoding="utf-8"))]
     assert importers == [only], "take meshreg.refine.open3d_loading.load_open3d() instead"

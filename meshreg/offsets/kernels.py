@@ -1,4 +1,4 @@
-"""Compiled loops of the estimators. Their readable twins are in `tests/reference_offsets.py`."""
+"""Compiled loops of the estimators. Readable twins: `tests/helpers/reference_offsets.py`."""
 
 from __future__ import annotations
 

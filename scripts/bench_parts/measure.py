@@ -60,7 +60,9 @@ def apart(module: str, function: str, *arguments: Any) -> dict[str, Any]:
 
     `module` is a file in scripts/bench_parts. A dict that the function returns is merged in.
     """
-    code = _CHILD.format(paths=[str(Path(__file__).parent), str(ROOT), str(ROOT / "tests")])
+    code = _CHILD.format(
+        paths=[str(Path(__file__).parent), str(ROOT), str(ROOT / "tests" / "helpers")]
+    )
     said = json.dumps([module, function, arguments])
     command = [sys.executable, "-c", code, said]
     done = subprocess.run(command, capture_output=True, text=True, check=False)

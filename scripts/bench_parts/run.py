@@ -84,7 +84,7 @@ def main() -> int:
     names = chosen.part or parts()
     if unknown := sorted(set(names) - set(parts())):
         parser.error(f"no part {unknown[0]!r}; there are {', '.join(parts())}")
-    sys.path[:0] = [str(HERE), str(ROOT), str(ROOT / "tests")]
+    sys.path[:0] = [str(HERE), str(ROOT), str(ROOT / "tests" / "helpers")]
     on = machine()
     sections, failures = [], []
     for name in names:

@@ -43,7 +43,7 @@ class Job:
 
 def make_inputs(folder: Path) -> None:
     """Write the pair: bumps of sand and rock, 4 m wide, the second survey moved by 0.2 m."""
-    sys.path.insert(0, str(ROOT / "tests"))
+    sys.path.insert(0, str(ROOT / "tests" / "helpers"))
     from seafloor import Seafloor
 
     import meshreg

@@ -12,12 +12,12 @@ import pyproj
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from reference_io import utm
 from scipy.spatial.transform import Rotation
 
 from meshreg.errors import InputError, MeshregError, OutputError
 from meshreg.io import read_survey, rewrite_survey, write_survey
 from meshreg.records import Frame, PointCloud, SourceFile, Survey, Transform
-from tests.reference_io import utm
 
 DATA = Path(__file__).parent.parent / "data" / "las"
 BEACH = np.array([731_500.0, 5_705_400.0, 3.0])

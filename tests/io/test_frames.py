@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from reference_io import scale_and_convergence, utm
 
 from meshreg.errors import InputError, UsageError
 from meshreg.io.frames.axes import NED, UNITS, Y_UP
@@ -32,7 +33,6 @@ from meshreg.io.frames.place import (
 )
 from meshreg.io.options import ReadOptions
 from meshreg.records import Frame, PointCloud, SourceFile, Survey, Transform
-from tests.reference_io import scale_and_convergence, utm
 
 BEACH = (731_500.0, 5_705_400.0, 3.0)  # EPSG:32754, Victoria
 OREGON_FEET = (637_000.0, 851_000.0, 450.0)  # EPSG:2992

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rasterio
+import reference_regrid
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from rasterio import Affine
@@ -30,7 +31,6 @@ from meshreg.records import (
     SurveyRaster,
     Transform,
 )
-from tests import reference_regrid
 
 WEST, NORTH = 500000.0, 6000040.0
 CRS = "EPSG:32754"

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from reference_io import fields_of, rows_of, spliced, utm
 
 from meshreg.errors import InputError, MeshregError, OutputError
 from meshreg.io import read_survey, rewrite_survey, write_survey
 from meshreg.io.text.kernels import count_rows, parse_rows, splice_rows
 from meshreg.records import Frame, PointCloud, SourceFile, Survey, Transform
-from tests.reference_io import fields_of, rows_of, spliced, utm
 
 POINTS = [[1.5, 2.25, 3.0], [4.0, -5.5, 6.125]]
 

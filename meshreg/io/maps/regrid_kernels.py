@@ -1,4 +1,4 @@
-"""The loop of `meshreg.io.maps.regrid`, compiled. Its slow twin is in tests/reference_regrid.py."""
+"""The loop of `meshreg.io.maps.regrid`, compiled. Slow twin: tests/helpers/reference_regrid.py."""
 
 # ruff: noqa: PLR0913, PLR0917  (a kernel takes plain arrays, not records)
 

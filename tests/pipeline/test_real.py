@@ -11,7 +11,7 @@ import pytest
 
 from meshreg import PointCloud, Settings, read_survey, register_pair
 
-DATA = Path(__file__).parent / "data"
+DATA = Path(__file__).parents[1] / "data"
 WIDE = Settings().changed({"search.radius": 30.0})
 
 

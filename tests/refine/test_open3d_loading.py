@@ -13,7 +13,7 @@ import pytest
 from meshreg.refine import open3d_loading
 from meshreg.refine.open3d_loading import LIBUSB, load_libusb
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 LINUX = pytest.mark.skipif(sys.platform != "linux", reason="elsewhere Open3D brings its own libusb")
 
 

@@ -28,7 +28,7 @@ from meshreg.refine.tiles import TileOffsets
 from meshreg.statistics.kriging import Ground
 
 OFFSET = (1.237, -2.412)
-REEF = Path(__file__).parent / "data" / "reef_dem" / "horseshoe_dem.tif"
+REEF = Path(__file__).parents[1] / "data" / "reef_dem" / "horseshoe_dem.tif"
 
 
 @functools.cache

@@ -35,7 +35,7 @@ from meshreg.io.result.document import read_registration
 from meshreg.records import Grid, Maps, Mesh, PointCloud, Survey, Transform
 from meshreg.settings import Settings
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 SCHEMA = json.loads(
     (Path(meshreg.__file__).parent / "io/result/registration.schema.json").read_text()
 )
@@ -273,7 +273,7 @@ def test_a_lost_shift_is_made_up_for_and_said(
 def test_a_crs_on_one_side_only_is_no_obstacle(tmp_path: Path, run: Run, side: str) -> None:
     """The whole way: the numbers of both are one local frame, and it is said."""
     import pyproj
-    from test_pipeline import OFFSET, displaced, floors, survey
+    from surveys import OFFSET, displaced, floors, survey
 
     first, later = floors()
     reference = survey(first, half=3.0, name="old")

@@ -3,31 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 
 import numpy as np
 import pytest
-import seafloor
+from judged import OFFSET, SETTINGS, pair, verdict
 from scipy import ndimage
 
 from meshreg.judge.judging import TURN_NAMES, agree_distance, channel_map, judge, relief_of
-from meshreg.offsets import estimate_offsets
 from meshreg.offsets.neutral import fields
 from meshreg.records import Grid, OffsetEstimate, SurveyRaster
 from meshreg.settings import Settings
-
-OFFSET = (1.237, -2.412)
-SETTINGS = Settings().changed({"methods": "terrain,mutual_information", "search.radius": 5.0})
-
-
-@functools.cache
-def pair(seed, change=0.4, **kind):
-    return seafloor.rasters(seed, OFFSET, change=change, half=7.0, size=20.0, **kind)
-
-
-def verdict(rasters, settings=SETTINGS):
-    estimates = estimate_offsets(rasters, settings)
-    return judge(estimates, rasters, settings, settings.search.radius)
 
 
 def swapped_moving(rasters, change):

@@ -19,7 +19,7 @@ from meshreg.judge.verdict import Found, findings
 from meshreg.records import Grid, Transform
 from meshreg.refine.surfaces import check_surfaces, polish, sampled
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 SIGMA = {"x": 0.004, "y": 0.004, "z": 0.004}
 
 

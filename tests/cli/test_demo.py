@@ -19,7 +19,7 @@ from rich.console import Console
 import meshreg
 from meshreg.cli import console, demonstrating
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 SCHEMA = json.loads(
     (Path(meshreg.__file__).parent / "io/result/registration.schema.json").read_text()
 )

@@ -17,7 +17,7 @@ from PIL import Image
 from meshreg.cli import drawing
 from meshreg.report import draw_figures
 
-SMALL = str(Path(__file__).parent.parent / "meshreg" / "demo_data" / "beach_2018.obj")
+SMALL = str(Path(__file__).parents[2] / "meshreg" / "demo_data" / "beach_2018.obj")
 
 
 @pytest.fixture

@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 import seafloor
-from test_pipeline import QUICK, displaced, floors, survey
+from surveys import QUICK, displaced, floors, survey
 
 from meshreg import Mesh, PointCloud, Survey, register_pair
 from meshreg.errors import InputError

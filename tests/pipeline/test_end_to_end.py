@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
-from test_pipeline import OFFSET, floors, survey
+from surveys import OFFSET, floors, survey
 
 from meshreg.cli import app as cli
 from meshreg.ties.table import COLUMNS

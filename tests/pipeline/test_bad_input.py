@@ -1,6 +1,6 @@
 """Which tests prove what each kind of bad input gets: one row a kind.
 
-`pytest tests/test_bad_input.py -v` lists them; a row names its tests as file::function.
+`pytest tests/pipeline/test_bad_input.py -v` lists them; a row names its tests as file::function.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_judge import pair, verdict
+from judged import pair, verdict
 
-TESTS = Path(__file__).parent
+TESTS = Path(__file__).parents[1]
 ROWS: dict[int, tuple[str, str]] = {
     1: ("empty file", "io/test_front.py::test_an_empty_file_is_refused"),
     2: (
@@ -161,7 +161,7 @@ ROWS: dict[int, tuple[str, str]] = {
     33: (
         "unseen faces of one color",
         "raster/test_finishing.py::test_fill_of_any_color_is_masked_and_counted "
-        "test_pairing.py::test_what_was_left_out_is_counted_and_small_shares_are_not",
+        "cli/test_pairing.py::test_what_was_left_out_is_counted_and_small_shares_are_not",
     ),
     34: (
         "UV outside 0-1",
@@ -178,7 +178,7 @@ ROWS: dict[int, tuple[str, str]] = {
         "UTM in 64 bits",
         "io/test_ply.py::test_large_coordinates_keep_their_millimetres "
         "io/test_obj.py::test_large_coordinates_keep_their_digits "
-        "test_pipeline.py::test_large_coordinates_change_nothing",
+        "pipeline/test_pipeline.py::test_large_coordinates_change_nothing",
     ),
     37: (
         "UTM in 32 bits",
@@ -196,18 +196,18 @@ ROWS: dict[int, tuple[str, str]] = {
     ),
     39: (
         "shifts that differ",
-        "test_pairing.py::test_a_lost_shift_leaves_one_local_frame "
-        "test_pairing.py::test_what_is_stated_stands_and_is_told "
-        "test_cli.py::test_a_lost_shift_is_made_up_for_and_said",
+        "cli/test_pairing.py::test_a_lost_shift_leaves_one_local_frame "
+        "cli/test_pairing.py::test_what_is_stated_stands_and_is_told "
+        "cli/test_cli.py::test_a_lost_shift_is_made_up_for_and_said",
     ),
     40: (
         "Y-up against Z-up",
         "io/test_gltf.py::test_plainly_z_up_is_read_so_and_told "
-        "test_cli.py::test_info_measures_the_tilt "
-        "test_pairing.py::test_an_upright_survey_is_told",
+        "cli/test_cli.py::test_info_measures_the_tilt "
+        "cli/test_pairing.py::test_an_upright_survey_is_told",
     ),
-    41: ("mirrored", "test_judge.py::test_mirrored_and_turned_surveys_are_named"),
-    42: ("other units", "test_pairing.py::test_units_that_differ_are_named"),
+    41: ("mirrored", "judge/test_judge.py::test_mirrored_and_turned_surveys_are_named"),
+    42: ("other units", "cli/test_pairing.py::test_units_that_differ_are_named"),
     43: (
         "COLMAP frame not level",
         "io/test_colmap.py::test_model_comes_level_and_without_scale "
@@ -222,7 +222,7 @@ ROWS: dict[int, tuple[str, str]] = {
         "CRS on one side only",
         "io/test_frames.py::"
         "test_a_missing_crs_is_local_and_said_with_scale_and_convergence "
-        "test_cli.py::test_a_crs_on_one_side_only_is_no_obstacle",
+        "cli/test_cli.py::test_a_crs_on_one_side_only_is_no_obstacle",
     ),
     46: (
         "vertical datum without a way",
@@ -237,18 +237,21 @@ ROWS: dict[int, tuple[str, str]] = {
         "PROJ_DATA wrong",
         "io/test_frames.py::test_a_wrong_proj_data_is_forgotten_with_a_note "
         "io/test_frames.py::test_a_wrong_proj_data_does_not_stop_a_change_of_crs "
-        "test_cli.py::test_doctor_sees_a_wrong_proj_data",
+        "cli/test_cli.py::test_doctor_sees_a_wrong_proj_data",
     ),
     49: (
         "no overlap",
-        "test_judge.py::test_another_place_is_rejected "
-        "test_pipeline.py::"
+        "judge/test_judge.py::test_another_place_is_rejected "
+        "pipeline/test_pipeline.py::"
         "test_surveys_kilometres_apart_are_rejected_without_rasterizing_the_sea_between",
     ),
-    50: ("overlap of 5-20 %", "test_bad_input.py::test_a_narrow_overlap_is_never_accepted"),
+    50: (
+        "overlap of 5-20 %",
+        "pipeline/test_bad_input.py::test_a_narrow_overlap_is_never_accepted",
+    ),
     51: (
         "ripples",
-        "test_judge.py::test_periodic_ground_is_not_accepted_at_the_wrong_crest",
+        "judge/test_judge.py::test_periodic_ground_is_not_accepted_at_the_wrong_crest",
     ),
     52: (
         "floaters",
@@ -259,7 +262,7 @@ ROWS: dict[int, tuple[str, str]] = {
         "overhangs",
         "raster/test_drawing.py::test_the_highest_surface_wins_whatever_the_order "
         "raster/test_point_binning.py::test_what_lies_under_the_top_layer_is_left_out "
-        "test_pairing.py::test_what_was_left_out_is_counted_and_small_shares_are_not",
+        "cli/test_pairing.py::test_what_was_left_out_is_counted_and_small_shares_are_not",
     ),
     54: (
         "holes",
@@ -270,12 +273,12 @@ ROWS: dict[int, tuple[str, str]] = {
     ),
     55: (
         "doming, scale",
-        "test_warp.py::test_doming_is_named_and_measured "
-        "test_warp.py::test_a_horizontal_bend_is_named_and_recovered",
+        "deformation/test_warp.py::test_doming_is_named_and_measured "
+        "deformation/test_warp.py::test_a_horizontal_bend_is_named_and_recovered",
     ),
     56: (
         "cloud without color",
-        "test_judge.py::test_terrain_alone_may_be_overwhelming "
+        "judge/test_judge.py::test_terrain_alone_may_be_overwhelming "
         "io/test_cloud.py::test_a_local_cloud_is_local",
     ),
     57: ("LAS cut at a record", "io/test_cloud.py::test_a_file_cut_at_a_record_is_refused"),
@@ -355,50 +358,50 @@ ROWS: dict[int, tuple[str, str]] = {
     74: (
         "the same file twice",
         "io/test_front.py::test_the_same_bytes_twice_are_said "
-        "test_cli.py::test_same_file_twice_is_said",
+        "cli/test_cli.py::test_same_file_twice_is_said",
     ),
     75: (
         "a file that changes",
         "io/test_front.py::test_a_file_that_changes_during_the_run_is_noticed "
         "io/test_front.py::test_a_file_that_belongs_to_a_survey_is_noticed_too "
         "io/test_front.py::test_a_file_that_changes_while_it_is_read_is_noticed "
-        "test_cli.py::test_input_that_changes_meanwhile_gives_no_output",
+        "cli/test_cli.py::test_input_that_changes_meanwhile_gives_no_output",
     ),
     76: (
         "disk full",
         "io/test_safe.py::test_atomic_file_survives_a_fault_at_every_call "
         "io/test_safe.py::test_atomic_folder_survives_a_fault_at_every_call "
-        "test_cli.py::test_full_disk_is_found_before_the_work",
+        "cli/test_cli.py::test_full_disk_is_found_before_the_work",
     ),
     77: (
         "output read-only",
-        "test_cli.py::test_output_that_cannot_be_written_is_found_before_the_work",
+        "cli/test_cli.py::test_output_that_cannot_be_written_is_found_before_the_work",
     ),
     78: (
         "output exists",
-        "test_cli.py::test_existing_output_is_refused_then_replaced "
-        "test_cli.py::test_a_folder_of_somebody_elses_is_never_replaced",
+        "cli/test_cli.py::test_existing_output_is_refused_then_replaced "
+        "cli/test_cli.py::test_a_folder_of_somebody_elses_is_never_replaced",
     ),
     79: (
         "more memory than there is",
-        "test_pairing.py::test_rasters_larger_than_memory_are_refused_before_the_work "
+        "cli/test_pairing.py::test_rasters_larger_than_memory_are_refused_before_the_work "
         "raster/test_lattice.py::test_the_limit_names_its_numbers "
         "io/test_images.py::test_a_page_larger_than_memory_is_refused_before_decoding "
-        "test_cli.py::test_what_goes_wrong_is_one_message_and_no_output",
+        "cli/test_cli.py::test_what_goes_wrong_is_one_message_and_no_output",
     ),
     80: (
         "signals",
-        "test_cli.py::test_signals_stop_the_job_and_leave_nothing "
-        "test_cli.py::test_second_signal_ends_at_once",
+        "cli/test_cli.py::test_signals_stop_the_job_and_leave_nothing "
+        "cli/test_cli.py::test_second_signal_ends_at_once",
     ),
     81: (
         "two runs at once",
         "io/test_safe.py::test_a_second_run_is_kept_out_while_the_first_lives "
-        "test_cli.py::test_a_second_run_into_one_folder_is_refused",
+        "cli/test_cli.py::test_a_second_run_into_one_folder_is_refused",
     ),
     82: (
         "markup in names",
-        "test_cli.py::test_names_with_markup_are_shown_as_they_are",
+        "cli/test_cli.py::test_names_with_markup_are_shown_as_they_are",
     ),
 }
 

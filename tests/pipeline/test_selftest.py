@@ -9,7 +9,7 @@ import math
 import numpy as np
 import pytest
 import seafloor
-from test_pipeline import OFFSET, displaced, floors, survey
+from surveys import OFFSET, displaced, floors, survey
 
 import meshreg
 from meshreg import Settings

@@ -18,7 +18,7 @@ from meshreg.errors import UsageError
 from meshreg.settings import Settings, TerrainSettings, read_settings, write_settings
 from meshreg.settings.checked import wanted
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 
 
 def every_setting() -> Iterator[tuple[str, str, Any]]:

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 PARTS = ROOT / "scripts" / "stress_parts"
 NOTICE = """
 import os, signal, sys, time

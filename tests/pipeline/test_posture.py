@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_pipeline import QUICK, displaced, floors
-from test_pipeline import survey as ground
+from surveys import QUICK, displaced, floors
+from surveys import survey as ground
 
 from meshreg import Mesh, PointCloud, Survey, register_pair
 from meshreg.io.frames.axes import ENU, NED, Y_UP
