@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from meshreg.records import Float64, Grid, SurveyRaster, Warp
+from meshreg.statistics import biweight
 
 LEAST_TILES = 6
 _NODE = 16  # cells between the places where the inverse of a warp is solved
@@ -80,7 +81,7 @@ def common_value(values: Float64) -> float:
     middle = float(ordered[at : at + third + 1].mean())
     spread = max(float(width[at]) / (2 * 0.4307), 1e-9)  # a third lies within 0.4307 deviations
     for _ in range(10):
-        weight = np.clip(1 - ((ordered - middle) / (2.5 * spread)) ** 2, 0, None) ** 2
+        weight = biweight((ordered - middle) / (2.5 * spread))
         if not weight.any():
             break
         middle = float(np.average(ordered, weights=weight))

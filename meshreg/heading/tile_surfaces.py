@@ -14,9 +14,9 @@ import numpy as np
 
 from meshreg.offsets import neutral
 from meshreg.offsets.correlate import WORKERS
-from meshreg.offsets.surface import MAD_TO_SIGMA
 from meshreg.raster.grid import cell_offset, coarsened
 from meshreg.records import Bool, Float32, Float64, Grid, OffsetAt, SurveyRaster
+from meshreg.statistics import MAD_TO_SIGMA
 
 TILES = 5  # along the patch
 TILE_CELLS = (16, 24)  # a larger tile's corners run off its peak when it is turned by 8°

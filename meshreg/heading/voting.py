@@ -29,9 +29,9 @@ from meshreg.heading.tile_surfaces import (
     surfaces_near,
 )
 from meshreg.offsets.correlate import Window
-from meshreg.offsets.surface import MAD_TO_SIGMA
 from meshreg.records import Bool, Float32, Float64, OffsetAt, SurveyRaster
 from meshreg.settings import SearchSettings
+from meshreg.statistics import MAD_TO_SIGMA, biweight
 
 Pair = tuple[SurveyRaster, SurveyRaster]
 ACROSS = 100  # voting cells along the patch: enough for 25 tiles, few enough for a fraction of 1 s
@@ -546,7 +546,7 @@ def similarity(
         answer = np.linalg.solve(normal, np.einsum("mij,m,mi->j", design, weights, moved))
         left = np.hypot(*(moved - design @ answer).T)
         deviation = max(MAD_TO_SIGMA * float(np.median(left)) / 1.2, floor)
-        weights = np.clip(1 - (left / (4 * deviation)) ** 2, 0, None) ** 2
+        weights = biweight(left / (4 * deviation))
     share = weights / weights.sum()
     scale = math.hypot(1 + answer[2], answer[3])
     explained = abs(scale - 1) * math.sqrt(float(share @ (arm**2).sum(axis=1)))

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from meshreg.records import Bool, Float64
 
 Index = NDArray[np.int_]
-MAD_TO_SIGMA = 1.4826
 HALF_WIDTH = 1.349  # the shortest half of a normal distribution is this many sigmas wide
 QUARTER = 0.3186  # sigmas: a quarter of a normal distribution lies nearer to its middle
 CUT = 2.5  # sigmas; what lies further from a block's ground has changed

@@ -15,7 +15,6 @@ import numpy as np
 from meshreg.height.dem_pair import DemPair
 from meshreg.height.ground import (
     BLOCK_CUT,
-    MAD_TO_SIGMA,
     ROUNDING,
     Index,
     block_grounds,
@@ -26,7 +25,7 @@ from meshreg.height.ground import (
     slow_bending,
 )
 from meshreg.records import Bool, Float64, Transform, UInt8
-from meshreg.statistics import block_sandwich
+from meshreg.statistics import MAD_TO_SIGMA, block_sandwich
 
 MIN_BLOCKS = 12
 # m: algal turf is several millimetres to centimetres tall (Connell, Foster and Airoldi, Marine

@@ -14,7 +14,7 @@ import numpy as np
 
 from meshreg.height.dem_pair import DemPair, points_of
 from meshreg.height.gain import relief_gain
-from meshreg.height.ground import MAD_TO_SIGMA, block_grounds, numbered
+from meshreg.height.ground import block_grounds, numbered
 from meshreg.height.ground_plane import CHANGED, SET_ASIDE, STABLE, UNKNOWN, GroundPlane, fit_plane
 from meshreg.records import (
     Float64,
@@ -28,6 +28,7 @@ from meshreg.records import (
     Warp,
 )
 from meshreg.refine import find_tear
+from meshreg.statistics import MAD_TO_SIGMA
 
 __all__ = [
     "CHANGED",

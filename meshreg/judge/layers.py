@@ -13,6 +13,7 @@ import math
 import numpy as np
 
 from meshreg.records import Bool, Float64, Layer, Maps, Survey, SurveyRaster
+from meshreg.statistics import nmad
 
 MOST_POINTS = 400_000  # that are looked at
 MOST_VOTES = 4_000  # of the points off the surface, that say where a copy lies
@@ -58,7 +59,7 @@ def second_surface(survey: Survey, dem: SurveyRaster, seed: int = 0) -> Layer | 
     if len(points) < LEAST_OFF:
         return None
     cells, where = np.unique(surface.cell_of(points), return_inverse=True)
-    noise = 1.4826 * float(np.median(np.abs(rest - np.median(rest))))
+    noise = nmad(rest)
     noise = max(noise, 0.02 * dem.grid.cell)
     deviation = np.hypot(noise, rough)
     off = np.abs(rest) > OFF * deviation

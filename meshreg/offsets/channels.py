@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from meshreg.records import Bool, Float64, SurveyRaster
+from meshreg.statistics.scale import MAD_TO_SIGMA
 
 
 def grey(raster: SurveyRaster) -> Float64:
@@ -100,7 +101,7 @@ def orientation(
 def _clipped(field: Float64, mask: Any, deviations: float = 3.0) -> Float64:
     if not mask.any():
         return field
-    spread = 1.4826 * float(np.median(np.abs(field[mask])))
+    spread = MAD_TO_SIGMA * float(np.median(np.abs(field[mask])))
     if spread <= 0:
         spread = float(np.std(field[mask])) or 1.0
     return np.clip(field, -deviations * spread, deviations * spread)

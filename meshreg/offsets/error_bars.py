@@ -22,9 +22,8 @@ from typing import Any
 
 import numpy as np
 
-from meshreg.offsets.surface import MAD_TO_SIGMA
 from meshreg.records import Bool, Float64, Grid
-from meshreg.statistics import Ground, best_motion, block_sandwich, overlap_ground
+from meshreg.statistics import MAD_TO_SIGMA, Ground, best_motion, block_sandwich, overlap_ground
 
 BLOCK = 2.0  # m: several times the length over which high-passed heights or grey are alike
 BLOCK_CELLS = (16, 40)  # but at least and at most so many cells wide

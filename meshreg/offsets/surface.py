@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 
 from meshreg.records import Float64
-
-MAD_TO_SIGMA = 1.4826
+from meshreg.statistics.scale import MAD_TO_SIGMA
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,6 @@ import numpy as np
 
 from meshreg.offsets import neutral
 from meshreg.offsets.channels import smooth
-from meshreg.offsets.surface import MAD_TO_SIGMA
 from meshreg.records import Bool, Finding, Float64, OffsetAt, SurveyRaster
 from meshreg.refine.tiles import (
     MAX_YAW,
@@ -27,7 +26,15 @@ from meshreg.refine.tiles import (
     polished_tiles,
     spread_of_fields,
 )
-from meshreg.statistics import Ground, best_motion, block_sandwich, design, overlap_ground
+from meshreg.statistics import (
+    MAD_TO_SIGMA,
+    Ground,
+    best_motion,
+    biweight,
+    block_sandwich,
+    design,
+    overlap_ground,
+)
 
 MIN_TILES = 6
 LEAST_FOR_SCALE = 12  # tiles, for a scale of their own
@@ -393,7 +400,7 @@ def fit(tiles: TileOffsets, pivot: Float64) -> Refined:
         residual = tiles.offsets - columns @ answer
         size = np.hypot(*residual.T)
         scale = _scales(size, tiles.channel)
-        weights = np.clip(1 - (size / (4 * scale)) ** 2, 0, None) ** 2 / scale**2
+        weights = biweight(size / (4 * scale)) / scale**2
         normal = np.einsum("mij,m,mik->jk", columns, weights, columns)
         step = np.linalg.solve(normal, np.einsum("mij,m,mi->j", columns, weights, residual))
         answer = answer + step

@@ -20,7 +20,7 @@ import numpy as np
 
 from meshreg.errors import UsageError
 from meshreg.records import Bool, Float64, Grid, Maps, Mesh, Survey, Transform
-from meshreg.statistics import block_sandwich
+from meshreg.statistics import biweight, block_sandwich
 
 GATE = 0.03  # m: points further apart have changed, or are not the same surface
 PLAINLY = 0.8  # of the distance before: on level ground a slide changes little
@@ -245,7 +245,7 @@ def _agreement(fixed: Float64, normals: Float64, loose: Float64) -> tuple[float,
     along = ((points - fixed[which[near]]) * normal).sum(axis=1)
     rms, share = float(np.sqrt(np.mean(along**2))), float(near.mean())
     design = np.hstack([normal, np.cross(points, normal)])
-    weight = (1 - (along / GATE) ** 2) ** 2
+    weight = biweight(along / GATE)
     low = points[:, :2].min(axis=0)
     side = float(np.ptp(points[:, :2], axis=0).max()) / BLOCKS
     cell = ((points[:, :2] - low) / side).astype(int)

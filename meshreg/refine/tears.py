@@ -15,7 +15,7 @@ import numpy as np
 
 from meshreg.records import Bool, Float64, Tear
 from meshreg.refine.tiles import TileOffsets
-from meshreg.statistics import RAYLEIGH
+from meshreg.statistics import RAYLEIGH, biweight
 
 LEAST_TILES = 16
 LEAST_SHARE = 0.12  # of the tiles: a smaller piece is ground that has changed
@@ -133,7 +133,7 @@ def _fit(design: Float64, values: Float64, start: Float64, resolution: float) ->
         freedom = max(1.0 - design.shape[1] / max(float((weights > 0).sum()), 1.0), 0.2)
         scale = float(np.median(size)) / RAYLEIGH[values.shape[1]] / np.sqrt(freedom)
         scale = max(scale, resolution)
-        before, weights = weights, np.clip(1 - (size / (4 * scale)) ** 2, 0, None) ** 2
+        before, weights = weights, biweight(size / (4 * scale))
         if np.abs(weights - before).max() < 1e-4:
             break
     return _Fit(np.asarray(answer), weights, size, scale)

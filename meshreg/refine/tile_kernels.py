@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 
 from meshreg.jit import jit, prange
+from meshreg.statistics.scale import MAD_TO_SIGMA
 
 STEPS = 15
 STILL = 1e-7  # m; a step this small ends the search
 ONE_WAY = 1e4  # condition from which the relief tells only one direction
-MAD_TO_SIGMA = 1.4826
 
 
 @jit(parallel=True)

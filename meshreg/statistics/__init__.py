@@ -24,12 +24,14 @@ from meshreg.statistics.scale import (
     MAD_TO_SIGMA,
     nmad,
 )
+from meshreg.statistics.weights import biweight
 
 __all__ = [
     "MAD_TO_SIGMA",
     "RAYLEIGH",
     "Ground",
     "best_motion",
+    "biweight",
     "block_sandwich",
     "design",
     "groups_of",

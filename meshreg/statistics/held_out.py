@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from meshreg.records import Float64
+from meshreg.statistics.weights import biweight
 
 RAYLEIGH = {1: 0.6745, 2: 1.1774}  # median length of a normal deviate in 1 and 2 dimensions
 
@@ -97,7 +98,7 @@ def least_trimmed_squares(design: Float64, values: Float64, starts: int = 300) -
 def _weights(size: Float64, *, huber: bool) -> Float64:
     if huber:
         return np.asarray(np.minimum(1.0, 1.5 / np.maximum(size, 1e-12)))
-    return np.asarray(np.clip(1 - (size / 4.0) ** 2, 0, None) ** 2)
+    return biweight(size / 4.0)
 
 
 def _scale(size: Float64, channel: np.ndarray, dimension: int) -> Float64:
