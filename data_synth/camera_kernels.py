@@ -69,7 +69,7 @@ def march(z, high, step, west, north, centre, ray):
 
 @jit(parallel=True, nogil=True, error_model="numpy")
 def photograph(z, soft, wide, albedo, step, west, north, centre, turn, focal, shape, image, plan):
-    """Linear colour (h, w, 3) f32 seen by a pinhole camera; black where nothing was met.
+    """Linear color (h, w, 3) f32 seen by a pinhole camera; black where nothing was met.
 
     `centre` (3,) [m] and `turn` (3, 3), rows the camera's right, down and forward in the world;
     `image` a number pair that tells images apart.

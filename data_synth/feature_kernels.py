@@ -171,7 +171,7 @@ def _kelp(f, dx, dy, finest):
 
 @jit(nogil=True, error_model="numpy")
 def _white(f, r, g, b, light):
-    """Return the colour after bleaching: white with a trace of its own tint."""
+    """Return the color after bleaching: white with a trace of its own tint."""
     share = f.bleached
     tone = 0.40 + 0.26 * light
     return (
@@ -183,7 +183,7 @@ def _white(f, r, g, b, light):
 
 @jit(nogil=True, error_model="numpy")
 def _living(f, dx, dy, mark, finest):
-    """Colour of a coral's living tissue: `mark` is 0 in the gaps, 1 at tips, lobes and rims."""
+    """Color of a coral's living tissue: `mark` is 0 in the gaps, 1 at tips, lobes and rims."""
     fine = octaves(dx, dy, f.seed + 14, 0.05, finest, 0.6, 3)
     polyps = octaves(dx, dy, f.seed + 15, 0.011, finest, 0.7, 2)
     light = 0.55 + 0.7 * mark
@@ -217,7 +217,7 @@ def is_dead_here(f, dx, dy, finest):
 
 @jit(nogil=True, error_model="numpy")
 def feature_height(f, x, y, ground_z, finest):
-    """Return the height of a feature at a point (or NOTHING) and the mark that its colour needs."""
+    """Return the height of a feature at a point (or NOTHING) and the mark that its color needs."""
     dx, dy = x - f.x, y - f.y
     kind = f.kind
     if dx * dx + dy * dy > f.reach * f.reach or kind in (SEDIMENT, TURF):

@@ -26,7 +26,7 @@ from meshreg.records import Survey
 Progress = Callable[[str, float], None]
 FORMATS = {
     "obj": ".obj",  # several texture pages, local shift
-    "ply": ".ply",  # vertex colours
+    "ply": ".ply",  # vertex colors
     "ply-cloud": ".ply",
     "laz": ".laz",
     "glb": ".glb",
@@ -62,7 +62,7 @@ def make_pair(
     size : float, optional
         Side of the patch [m]; by default the recipe's.
     format : str
-        "obj" or "glb" (textured mesh), "ply" (mesh with vertex colours), "ply-cloud", "laz".
+        "obj" or "glb" (textured mesh), "ply" (mesh with vertex colors), "ply-cloud", "laz".
     progress : callable, optional
         Called with the stage's name and the fraction done of it.
 

@@ -218,14 +218,14 @@ def textured(take: Take, view: View, surface: Surface, pages: int, origin: Float
 
 
 def colored(take: Take, view: View, surface: Surface, origin: Float64) -> Mesh:
-    """Return the surface with a colour per vertex: the mosaic's mean over a mesh spacing."""
+    """Return the surface with a color per vertex: the mosaic's mean over a mesh spacing."""
     colors = colors_at(view, surface.vertices, take.sfm.mesh_spacing)
     vertices = surface.vertices + (take.distortion.start - origin)
     return Mesh(vertices=vertices, faces=surface.faces, colors=colors)
 
 
 def colors_at(view: View, points: Float64, width: float) -> UInt8:
-    """Mean colour (N, 3) of the mosaic in a square of side `width` [m] about centred points."""
+    """Mean color (N, 3) of the mosaic in a square of side `width` [m] about centred points."""
     import cv2
 
     lattice = view.lattice

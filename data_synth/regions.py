@@ -30,7 +30,7 @@ def describe_change(scene: Scene, step: float | None = None) -> dict[str, Any]:
         reference coordinates [m]: nothing of the thing is outside. Where things overlap their
         volumes [m3] are counted in each; `total` counts them once. `fields` names what changed
         everywhere (texture) or on the sand of either epoch (ripples, its level; with polygons).
-        Unless texture changed, all outside the polygons is what it was, height and colour.
+        Unless texture changed, all outside the polygons is what it was, height and color.
     """
     if scene.recipe.place.other_ground:
         return {"regions": [], "fields": {}, "total": None}

@@ -74,7 +74,7 @@ def _stand(x, y, index, finest, z, height, mark, winner):
 
 @jit(nogil=True, error_model="numpy")
 def _paint(x, y, features, finest, mark, winner, color):
-    """Colour what stands on the ground, in place; boulders only tint the rock that is there."""
+    """Color what stands on the ground, in place; boulders only tint the rock that is there."""
     for i in range(x.size):
         if winner[i] < 0:
             continue

@@ -160,7 +160,7 @@ def see(
         linear = cv2.GaussianBlur(linear, (0, 0), seeing.blur / lattice.step)
     thin = linear[:: max(1, linear.shape[0] // 400), :: max(1, linear.shape[1] // 400)]
     mean = thin.reshape(-1, 3).mean(axis=0, dtype=np.float64)
-    # a grey world half way: operators white-balance, yet a trace of the water's colour stays
+    # a grey world half way: operators white-balance, yet a trace of the water's color stays
     scale = seeing.exposure * np.array(seeing.cast) / (mean**0.6 * mean.mean() ** 0.4)
     mosaic: UInt8 = encode(
         linear,

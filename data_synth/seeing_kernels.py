@@ -142,7 +142,7 @@ def through_water(albedo, light, view, high, gains, plan, out):
 
 @jit(parallel=True, nogil=True, error_model="numpy")
 def radiance(z, soft, wide, albedo, step, west, north, mirror, plan):
-    """Linear colour (H, W, 3) f32 that the cameras saw of a lattice of the seafloor.
+    """Linear color (H, W, 3) f32 that the cameras saw of a lattice of the seafloor.
 
     Parameters
     ----------
@@ -176,7 +176,7 @@ def radiance(z, soft, wide, albedo, step, west, north, mirror, plan):
 
 @jit(parallel=True, nogil=True, error_model="numpy")
 def encode(linear, scale, gamma, noise, seed, west, north, step):
-    """Linear colour to 8 bits: exposure per channel `scale` (3,), gamma, sensor noise [counts]."""
+    """Linear color to 8 bits: exposure per channel `scale` (3,), gamma, sensor noise [counts]."""
     rows, cols, _ = linear.shape
     out = np.empty((rows, cols, 3), np.uint8)
     first_row, first_col = math.floor(-north / step), math.floor(west / step)

@@ -40,7 +40,7 @@ FEATURE = np.dtype(
         ("red", np.float64),  # reflectance 0..1
         ("green", np.float64),
         ("blue", np.float64),
-        ("bleached", np.float64),  # 0 its own colour .. 1 white
+        ("bleached", np.float64),  # 0 its own color .. 1 white
         ("dead", np.float64),  # share of the surface that is dead and overgrown
         ("reach", np.float64),  # nothing of it is further from the centre [m]
     ]

@@ -57,7 +57,7 @@ def _counts(geometry: Mesh | PointCloud | Maps) -> dict[str, int]:
     if isinstance(geometry, Maps):
         counts = {"cells with height": int(np.isfinite(geometry.height).sum())}
         if geometry.color_valid is not None:
-            counts["cells with colour"] = int(geometry.color_valid.sum())
+            counts["cells with color"] = int(geometry.color_valid.sum())
         return counts
     if isinstance(geometry, PointCloud):
         return {"points": len(geometry.points)}
@@ -86,7 +86,7 @@ def _spacing(survey: Survey) -> dict[str, float | None]:
     geometry = survey.geometry
     if isinstance(geometry, Maps):
         color = None if geometry.color_grid is None else geometry.color_grid.cell
-        return {"height cell": geometry.height_grid.cell, "colour cell": color}
+        return {"height cell": geometry.height_grid.cell, "color cell": color}
     if isinstance(geometry, PointCloud):
         return {"points": _point_spacing(geometry.points)}
     if len(geometry.faces) == 0:

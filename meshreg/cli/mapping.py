@@ -66,7 +66,7 @@ def rasterize(request: RasterizeRequest, voice: Terminal, unfinished: Unfinished
             raster = make_raster(survey, survey_grid(survey, cell, cell), options, mask=mask)
             seen = raster.valid if what == "height" else raster.color_valid
             if what == "color" and not seen.any():
-                LOG.warning("%s has no colour; no orthomosaic is written.", survey.name)
+                LOG.warning("%s has no color; no orthomosaic is written.", survey.name)
                 continue
             write_raster(raster, folder / f"{name}.tif", what, local_crs(survey))
             maps[name] = {

@@ -20,7 +20,7 @@ _UNLIKE = 2.5  # ratio of two surveys' widths from which their units are looked 
 _CLOSE = 0.15  # relative difference to a ratio of two units that counts as that ratio
 _WORTH_SAYING = 0.01  # of the ground; a cell at every edge is counted in part
 _CELL, _DRAWN = 11, 10  # bytes a cell: of a raster, and of one in the making
-_AREAS = ("flat colour", "beneath")  # counted in cells; the rest in triangles or points
+_AREAS = ("flat color", "beneath")  # counted in cells; the rest in triangles or points
 
 
 def require_scale(

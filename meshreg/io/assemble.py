@@ -253,7 +253,7 @@ def _without_idle_faces(raw: RawGeometry, path: Path) -> tuple[RawGeometry, tupl
 
 
 def _uv_notes(raw: RawGeometry) -> tuple[str, ...]:
-    """Say when texture coordinates leave the page, where they wrap or take the edge's colour."""
+    """Say when texture coordinates leave the page, where they wrap or take the edge's color."""
     if raw.uv is None or raw.face_texture is None:
         return ()
     if not raw.uv.size or (raw.uv.min() >= -1e-4 and raw.uv.max() <= 1 + 1e-4):
@@ -316,13 +316,13 @@ def without_broken_uv(
     uv = np.where(good[:, None, None], uv, np.float32(0))
     face_texture = np.where(good, face_texture, np.int32(-1))
     note = (
-        f"{lost} faces have texture coordinates that are not finite or far off; they get no colour."
+        f"{lost} faces have texture coordinates that are not finite or far off; they get no color."
     )
     return uv, face_texture, (note,) if lost else ()
 
 
 def eight_bit_colors(values: NDArray[Any]) -> tuple[UInt8, tuple[str, ...]]:
-    """Turn colours of any stored type (N, 3) into 8 bits.
+    """Turn colors of any stored type (N, 3) into 8 bits.
 
     8-bit values stay. 16-bit ones are divided by 257, unless none is above 255: then they hold
     8-bit values. Floats are 0-1, unless one is above 1: then they are 0-255. Other integers are
@@ -337,19 +337,19 @@ def eight_bit_colors(values: NDArray[Any]) -> tuple[UInt8, tuple[str, ...]]:
         finite = np.isfinite(values)
         scaled = np.where(finite, values, 0).astype(np.float64)
         lost = int(np.count_nonzero(~finite.all(axis=1)))
-        notes = [f"{lost} colours that are not finite became black."] if lost else []
+        notes = [f"{lost} colors that are not finite became black."] if lost else []
         if scaled.max() <= 1.0:
             scaled *= 255
         else:
-            notes.append("Colours are fractional numbers above 1; they were taken as 0-255.")
+            notes.append("Colors are fractional numbers above 1; they were taken as 0-255.")
     else:
         scaled = values.astype(np.float64)
         notes = []
         if values.dtype == np.uint16 and values.max() > 255:
             scaled /= 257
         elif values.dtype == np.uint16:
-            notes.append("Colours have 8-bit values in 16-bit fields; they were taken as 0-255.")
+            notes.append("Colors have 8-bit values in 16-bit fields; they were taken as 0-255.")
     outside = (scaled < -0.5) | (scaled > 255.5)
     if outside.any():
-        notes.append(f"{int(outside.any(axis=1).sum())} colours outside 0-255 were clipped.")
+        notes.append(f"{int(outside.any(axis=1).sum())} colors outside 0-255 were clipped.")
     return np.clip(np.rint(scaled), 0, 255).astype(np.uint8), tuple(notes)

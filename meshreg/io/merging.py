@@ -120,7 +120,7 @@ def _joined(surveys: Sequence[Survey], origin: Any, notes: list[str]) -> Mesh | 
     )
     colors = [part.colors for part in parts if part.colors is not None]
     if 0 < len(colors) < len(parts):
-        notes.append(f"Colours were left out: only {len(colors)} of {len(parts)} files have them.")
+        notes.append(f"Colors were left out: only {len(colors)} of {len(parts)} files have them.")
     joined = np.concatenate(colors) if len(colors) == len(parts) else None
     if isinstance(parts[0], PointCloud):
         return PointCloud(points, joined)

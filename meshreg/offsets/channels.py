@@ -1,4 +1,4 @@
-"""What two epochs still share after light, colour and coral have changed.
+"""What two epochs still share after light, color and coral have changed.
 
 Each channel turns a raster into one or more zero-mean fields with unit weight where it is known.
 High-passing removes warp, doming and uneven light; normalised gradients remove contrast, and
@@ -16,7 +16,7 @@ from meshreg.statistics.scale import MAD_TO_SIGMA
 
 
 def grey(raster: SurveyRaster) -> Float64:
-    """(H, W) float64: ITU-R BT.601 luma of a raster's colour, 0-255."""
+    """(H, W) float64: ITU-R BT.601 luma of a raster's color, 0-255."""
     return np.asarray(raster.color @ np.array([0.299, 0.587, 0.114]))
 
 

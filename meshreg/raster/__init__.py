@@ -59,7 +59,7 @@ def rasterize(
     -------
     SurveyRaster
         `masked` counts what was left out, where there is anything: triangles or points in
-        "floaters" and "not finite", triangles in "missing page", cells in "flat colour", in
+        "floaters" and "not finite", triangles in "missing page", cells in "flat color", in
         "mask", and in "beneath" (surface hidden under the top one: overhangs, double layers).
 
     Raises

@@ -62,7 +62,7 @@ def finished(
     if settings.mask_flat_color and layers.still is not None:
         unseen = flat_color(layers.color, layers.color_valid, layers.still, texel / grid.cell)
         if unseen is not None:
-            layers.masked["flat colour"] = int(np.count_nonzero(unseen & layers.color_valid))
+            layers.masked["flat color"] = int(np.count_nonzero(unseen & layers.color_valid))
             layers.color_valid &= ~unseen
     fill_gaps(layers, valid, settings.fill_cells)
     if mask is not None:

@@ -93,7 +93,7 @@ class SurveyRaster:
     datum : float
         Metres to add to `height` for absolute heights, so that float32 keeps its millimetres.
     masked : mapping
-        Counts of what was left out: "floaters", "flat colour", "mask", ...
+        Counts of what was left out: "floaters", "flat color", "mask", ...
     """
 
     grid: Grid

@@ -84,9 +84,9 @@ class Texture:
         From the image's header; nothing is decoded to know it.
     load : callable
         Returns (height, width, 3) or (height, width, 4) uint8, row 0 at the top; in the fourth
-        channel values under 128 mean "no colour here".
+        channel values under 128 mean "no color here".
     clamp : bool
-        Texture coordinates outside 0-1 take the edge's colour (else they wrap).
+        Texture coordinates outside 0-1 take the edge's color (else they wrap).
     """
 
     name: str
@@ -97,7 +97,7 @@ class Texture:
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """Triangles with colour per vertex, texture pages, both or none.
+    """Triangles with color per vertex, texture pages, both or none.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Charts of the page as SVG, whose colours follow the page's own (light, dark, print)."""
+"""Charts of the page as SVG, whose colors follow the page's own (light, dark, print)."""
 
 from __future__ import annotations
 

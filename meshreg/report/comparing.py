@@ -113,7 +113,7 @@ def _full_size(result: Result, kind: str) -> str:
 
 
 def section(result: Result) -> str:
-    """Both DEMs laid on each other in two colours, and the section that the reader drags."""
+    """Both DEMs laid on each other in two colors, and the section that the reader drags."""
     kept = result.kept
     stages = [stage for stage in ("before", "after") if f"tone_{stage}" in kept]
     if not stages or "height" not in kept.get("meta", {}):

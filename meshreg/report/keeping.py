@@ -33,7 +33,7 @@ BINS = 81
 _MODELLED = ("model_east", "model_north")
 # Bytes; with a third more for base64 they leave a page of 8 MB its text.
 ORTHO, RELIEF, TONE, DIFFERENCE, SMALL = 900_000, 280_000, 170_000, 200_000, 70_000
-# What a cell of ground was, in the numbers of `height`, and its colour in the picture.
+# What a cell of ground was, in the numbers of `height`, and its color in the picture.
 GROUNDS = {"changed": (1, "#E69F00"), "set_aside": (2, "#CC79A7"), "stable": (3, "#009E73")}
 NEAR = 0.1  # share of the search window that the picture around a peak shows
 _KEYS = {

@@ -73,7 +73,7 @@ def _cell(value: Any) -> str:
 
 
 def chip(status: str) -> Markup:
-    """Return a method's status as a coloured word."""
+    """Return a method's status as a colored word."""
     return Markup(f'<span class="chip {say(status)}">{say(status)}</span>')
 
 

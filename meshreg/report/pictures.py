@@ -1,4 +1,4 @@
-"""Pictures small enough to travel inside a page: shrunk, coloured, encoded within a given size."""
+"""Pictures small enough to travel inside a page: shrunk, colored, encoded within a given size."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _LADDER = (
 
 
 def shrunk(raster: SurveyRaster, side: int = SIDE) -> UInt8:
-    """Return (h, w, 4) uint8 of the colours, area means; transparent where nothing was seen."""
+    """Return (h, w, 4) uint8 of the colors, area means; transparent where nothing was seen."""
     from PIL import Image
 
     rows, cols = raster.grid.shape

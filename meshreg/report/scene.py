@@ -185,7 +185,7 @@ def _save(picture: Any, path: Path, exaggeration: float = 1.0) -> None:
 
 
 def _arrays(registration: Registration) -> dict[str, Any] | None:
-    """Both heights with their colours on one coarse grid, local metres; None without a result."""
+    """Both heights with their colors on one coarse grid, local metres; None without a result."""
     evidence = registration.evidence
     reference, moving = evidence.get("reference_dem"), evidence.get("moving_dem")
     if reference is None or moving is None:
@@ -216,7 +216,7 @@ def _arrays(registration: Registration) -> dict[str, Any] | None:
 
 
 def _color_at(ortho: Any, height: Any, grid: Any) -> Any:
-    """(rows, cols, 3) uint8 from the orthomosaic; grey relief where there is no colour."""
+    """(rows, cols, 3) uint8 from the orthomosaic; grey relief where there is no color."""
     shade = np.nan_to_num(style.hillshade(height, grid.cell), nan=0.7)
     grey = np.repeat((60 + 180 * np.clip(shade, 0, 1)).astype(np.uint8)[..., None], 3, axis=-1)
     if ortho is None or not ortho.color_valid.any():

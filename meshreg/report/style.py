@@ -1,4 +1,4 @@
-"""What all figures share: colours, axes in metres from a stated corner, reduced rasters."""
+"""What all figures share: colors, axes in metres from a stated corner, reduced rasters."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from meshreg.records import Float64, Grid, SurveyRaster, UInt8
 
-# Okabe and Ito's palette: told apart with every common colour vision, and in grey.
+# Okabe and Ito's palette: told apart with every common color vision, and in grey.
 REFERENCE = "#0072B2"  # blue
 MOVING = "#D55E00"  # vermilion
 GOOD, BAD = "#009E73", "#CC1F1F"  # bluish green; red, as thin lines
@@ -43,7 +43,7 @@ def new_figure(
 ) -> Any:
     """Return a figure of `width` × `height` inches that needs no screen, with its title.
 
-    `bars`: it has colour bars between its panels; only the slower layout keeps them apart.
+    `bars`: it has color bars between its panels; only the slower layout keeps them apart.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -106,7 +106,7 @@ def reduced_height(raster: SurveyRaster, side: int = MAX_SIDE) -> tuple[Float64,
 
 
 def reduced_color(raster: SurveyRaster, side: int = MAX_SIDE) -> tuple[Float64, Grid]:
-    """Return (h, w, 3) colours 0-1 in cells coarse enough for a picture, NaN where unseen."""
+    """Return (h, w, 3) colors 0-1 in cells coarse enough for a picture, NaN where unseen."""
     step = _step(raster.grid, side)
     channels = []
     for band in range(3):
@@ -150,7 +150,7 @@ def hillshade(height: Float64, cell: float) -> Float64:
 def two_tone(reference: Float64, moving: Float64) -> UInt8:
     """Overlay two grey pictures (0-1, NaN = none): blue is reference alone, red moving alone.
 
-    Where both are equally bright the picture is grey; a shift shows as coloured rims.
+    Where both are equally bright the picture is grey; a shift shows as colored rims.
     """
     alone_r, alone_m = np.isfinite(reference), np.isfinite(moving)
     ref, mov = np.nan_to_num(reference), np.nan_to_num(moving)
@@ -164,7 +164,7 @@ def two_tone(reference: Float64, moving: Float64) -> UInt8:
 
 
 def stretched(color: Float64) -> Float64:
-    """Grey 0-1 of a colour picture, its middle 96 % spread over the whole scale."""
+    """Grey 0-1 of a color picture, its middle 96 % spread over the whole scale."""
     grey = color @ np.array([0.299, 0.587, 0.114])
     if not np.isfinite(grey).any():
         return np.asarray(grey)
@@ -173,7 +173,7 @@ def stretched(color: Float64) -> Float64:
 
 
 def over_white(color: Float64) -> UInt8:
-    """(h, w, 3) uint8 of a colour picture, white where nothing was seen."""
+    """(h, w, 3) uint8 of a color picture, white where nothing was seen."""
     return np.asarray(np.round(255 * np.nan_to_num(np.clip(color, 0, 1), nan=1.0)), np.uint8)
 
 

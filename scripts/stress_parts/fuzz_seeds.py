@@ -64,7 +64,7 @@ def obj(kind: str) -> dict[str, bytes]:
 
 
 def ply(binary: bool) -> dict[str, bytes]:
-    """Return a PLY with colours, normals and a texture."""
+    """Return a PLY with colors, normals and a texture."""
     points, faces = ground()
     head = (
         f"ply\nformat {'binary_little_endian' if binary else 'ascii'} 1.0\n"
@@ -197,7 +197,7 @@ def las(name: str, minor: int, form: int) -> dict[str, bytes]:
 
 
 def e57() -> dict[str, bytes]:
-    """Return an E57 with colours and a pose."""
+    """Return an E57 with colors and a pose."""
     from meshreg.io import write_survey
     from meshreg.records import PointCloud, Survey
 
@@ -210,7 +210,7 @@ def e57() -> dict[str, bytes]:
 
 
 def xyz(name: str, header: str, comma: str) -> dict[str, bytes]:
-    """Return a text cloud with colours and normals."""
+    """Return a text cloud with colors and normals."""
     points, _ = ground()
     rows = [comma.join(map(str, (x, y, z, 90, 100, 80, 0, 0, 1))) for x, y, z in points]
     return {name: (header + "\n".join(rows) + "\n").encode()}

@@ -741,7 +741,7 @@ def test_rasterize_writes_a_dem(tmp_path: Path, pair: tuple[str, str], run: Run)
     code, said, error = run("rasterize", pair[0], "-o", out, "--dem-cell", 0.25, "--json")
     assert code == 0, error
     document = json.loads(said)
-    assert set(document["maps"]) == {"dem"}  # the mesh has no colour
+    assert set(document["maps"]) == {"dem"}  # the mesh has no color
     assert document["maps"]["dem"]["cell"] == 0.25
     with rasterio.open(out / "dem.tif") as file:
         assert file.res == (0.25, 0.25)
@@ -951,7 +951,7 @@ def test_info_measures_texels() -> None:
 def test_info_of_maps_and_of_projected_numbers_without_crs() -> None:
     grid = Grid(500_000.0, 6_000_000.0, 0.5, (4, 6))
     document = info.describe(Survey("made", Maps(np.zeros((4, 6)), grid)))
-    assert document["spacing"] == {"height cell": 0.5, "colour cell": None}
+    assert document["spacing"] == {"height cell": 0.5, "color cell": None}
     assert document["counts"] == {"cells with height": 24}
     assert any("no CRS" in note for note in document["notes"])
 

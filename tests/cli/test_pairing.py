@@ -123,7 +123,7 @@ def test_what_was_left_out_is_counted_and_small_shares_are_not():
     )  # fmt: skip
     seen = int(raster.valid.sum())
     masked = {
-        "reference": {"floaters": 12, "beneath": seen, "flat colour": seen // 200},
+        "reference": {"floaters": 12, "beneath": seen, "flat color": seen // 200},
         "moving": {"mask": 1},
     }
     registration = dataclasses.replace(

@@ -23,7 +23,7 @@ def relief(east: np.ndarray, north: np.ndarray) -> np.ndarray:
 
 
 def shade(east: np.ndarray, north: np.ndarray) -> np.ndarray:
-    """Colour (…, 3) uint8 of the made seafloor."""
+    """Color (…, 3) uint8 of the made seafloor."""
     x, y = east - EAST, north - NORTH
     grey = 0.5 + 0.3 * np.sin(2.1 * x + 0.4 * y) * np.sin(1.7 * y) + 0.2 * np.sin(5 * x - 4 * y)
     return (255 * np.clip(np.stack([0.9 * grey, grey, 0.8 * grey + 0.1], -1), 0, 1)).astype("u1")

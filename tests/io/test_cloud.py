@@ -88,7 +88,7 @@ def test_every_point_format(tmp_path, suffix, form):
 
 
 @pytest.mark.parametrize("largest", [255, 256, 65535])
-def test_colours_of_8_and_16_bits(tmp_path, largest):
+def test_colors_of_8_and_16_bits(tmp_path, largest):
     rng = np.random.default_rng(5)
     rgb = rng.integers(0, largest + 1, (500, 3)).astype(np.uint16)
     rgb[0] = largest

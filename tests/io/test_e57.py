@@ -254,7 +254,7 @@ def test_wide_colors_become_eight_bits(tmp_path, top, values, expected):
     path = e57_file(tmp_path / "a.e57", [{"columns": columns, "limits": limits}])
     survey = e57.read(path, ReadOptions())
     assert survey.geometry.colors[:, 0].tolist() == expected
-    assert survey.notes == ("Colours of more than 8 bits were scaled to 8.",)
+    assert survey.notes == ("Colors of more than 8 bits were scaled to 8.",)
 
 
 def test_colors_need_every_scan(tmp_path, points):
@@ -265,7 +265,7 @@ def test_colors_need_every_scan(tmp_path, points):
     survey = e57.read(e57_file(tmp_path / "a.e57", scans), ReadOptions())
     assert survey.geometry.colors is None
     assert len(survey.geometry.points) == 600
-    assert survey.notes == ("Colours were left out, because not every scan has them.",)
+    assert survey.notes == ("Colors were left out, because not every scan has them.",)
 
 
 @pytest.mark.parametrize(

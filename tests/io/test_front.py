@@ -339,7 +339,7 @@ def test_blocks_that_do_not_fit_are_refused(tmp_path):
         read_survey([local, mesh])
 
 
-def test_colours_of_some_blocks_only_are_left_out_and_said(tmp_path):
+def test_colors_of_some_blocks_only_are_left_out_and_said(tmp_path):
     las(tmp_path / "a.las", colors=[[10, 20, 30]] * 4)
     beside = np.add(SQUARE, (5, 0, 0))
     las(tmp_path / "b.las", beside)

@@ -83,11 +83,11 @@ class Made:
         self.tree["meshes"][mesh]["primitives"].append(primitive)
         return primitive
 
-    def texture(self, colour, **image):
+    def texture(self, color, **image):
         """Add image, texture and material of one page; return the material's number."""
         if not image:
             stream = io.BytesIO()
-            Image.new("RGB", (4, 2), colour).save(stream, "PNG")
+            Image.new("RGB", (4, 2), color).save(stream, "PNG")
             image = {"bufferView": self.view(stream.getvalue()), "mimeType": "image/png"}
         for kind, item in (
             ("images", image),
@@ -256,8 +256,8 @@ def textured():
     """Two primitives, each with a page of its own."""
     scene = Made()
     uv = scene.accessor(UV, "f")
-    for k, colour in enumerate([(255, 0, 0), (0, 0, 255)]):
-        material = scene.texture(colour)
+    for k, color in enumerate([(255, 0, 0), (0, 0, 255)]):
+        material = scene.texture(color)
         scene.primitive(faces=FACES[k], TEXCOORD_0=uv)["material"] = material
     return scene
 
@@ -305,7 +305,7 @@ def test_second_set_transform_and_clamp(tmp_path):
         {"extensions": {"KHR_materials_pbrSpecularGlossiness": {"diffuseTexture": {"index": 0}}}},
     ],
 )
-def test_other_places_of_the_colour_texture(tmp_path, material):
+def test_other_places_of_the_color_texture(tmp_path, material):
     scene = Made()
     scene.primitive(TEXCOORD_0=scene.accessor(UV, "f"))["material"] = scene.texture((7, 8, 9))
     scene.tree["materials"] = [material]
@@ -645,7 +645,7 @@ def test_broken_and_huge_images(tmp_path):
     scene.primitive(TEXCOORD_0=uv)["material"] = material
     survey = read(scene.glb(tmp_path / "a.glb"), ReadOptions())
     assert survey.geometry.uv is None
-    assert "gives no colour" in survey.notes[0]
+    assert "gives no color" in survey.notes[0]
     refuse(textured().glb(tmp_path / "b.glb"), "pixels", ResourceLimitError, max_pixels=7)
     scene.tree["images"][0]["bufferView"] = 99
     refuse(scene.glb(tmp_path / "c.glb"), r"bufferViews\[99\]")
@@ -951,7 +951,7 @@ def test_glb_without_its_binary_chunk_is_refused(tmp_path):
     refuse(made().glb(tmp_path / "a.glb", binary=False), "no uri and no BIN chunk")
 
 
-def test_primitives_with_and_without_colours(tmp_path):
+def test_primitives_with_and_without_colors(tmp_path):
     scene = Made()
     color = scene.accessor([[9, 8, 7, 255]] * 4, "B", normalized=True)
     scene.primitive(faces=FACES[0], COLOR_0=color)
@@ -959,7 +959,7 @@ def test_primitives_with_and_without_colours(tmp_path):
     survey = read(scene.glb(tmp_path / "a.glb"), ReadOptions())
     found = survey.geometry.colors[survey.geometry.faces]
     assert found.tolist() == [[[9, 8, 7]] * 3, [[255] * 3] * 3]
-    assert survey.notes[0] == "1 of 2 primitives have no colours; left white."
+    assert survey.notes[0] == "1 of 2 primitives have no colors; left white."
 
 
 def test_mirrored_repetition_is_told(tmp_path):

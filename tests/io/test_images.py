@@ -26,7 +26,7 @@ BIG = 10**9
 
 @pytest.fixture
 def pixels():
-    """Smooth colours, so that JPEG changes them little; each channel and axis differs."""
+    """Smooth colors, so that JPEG changes them little; each channel and axis differs."""
     row, col = np.mgrid[0:40, 0:60]
     return np.stack([row * 6, col * 4, (row + col) * 2], axis=2).astype(np.uint8)
 
@@ -104,7 +104,7 @@ def modes(pixels):
     rgba = np.dstack([pixels, alpha])
     palette = Image.fromarray((grey // 64).astype(np.uint8)).convert("P")
     palette.putpalette([10, 20, 30, 40, 50, 60, 70, 80, 90, 100, 110, 120])
-    colours = np.array([[10, 20, 30], [40, 50, 60], [70, 80, 90], [100, 110, 120]], np.uint8)
+    colors = np.array([[10, 20, 30], [40, 50, 60], [70, 80, 90], [100, 110, 120]], np.uint8)
     see_through = palette.copy()
     see_through.info["transparency"] = 0
     mask = np.where(grey // 64 == 0, 0, 255).astype(np.uint8)
@@ -115,8 +115,8 @@ def modes(pixels):
     return {
         "L": (Image.fromarray(grey), np.repeat(grey[..., None], 3, 2), ("png", "tif", "jpg")),
         "RGBA": (Image.fromarray(rgba), rgba, ("png", "tif", "webp")),
-        "P": (palette, colours[grey // 64], ("png", "tif")),
-        "P+transparency": (see_through, np.dstack([colours[grey // 64], mask]), ("png",)),
+        "P": (palette, colors[grey // 64], ("png", "tif")),
+        "P+transparency": (see_through, np.dstack([colors[grey // 64], mask]), ("png",)),
         "CMYK": (cmyk, pixels, ("tif", "jpg")),
         "1": (bilevel, np.where(grey > 100, 255, 0)[..., None].repeat(3, 2), ("png", "tif")),
         "I;16": (Image.fromarray(grey16), np.repeat(grey[..., None], 3, 2), ("png", "tif")),
@@ -164,19 +164,19 @@ def test_converted_modes_are_noted(tmp_path, pixels):
     assert "CMYK" in notes[0]
 
 
-def png(width, height, depth, colour, rows):
+def png(width, height, depth, color, rows):
     """Make a PNG of any bit depth, byte by byte."""
 
     def chunk(kind, data):
         body = kind + data
         return struct.pack(">I", len(data)) + body + struct.pack(">I", zlib.crc32(body))
 
-    head = struct.pack(">IIBBBBB", width, height, depth, colour, 0, 0, 0)
+    head = struct.pack(">IIBBBBB", width, height, depth, color, 0, 0, 0)
     start = b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head)
     return start + chunk(b"IDAT", zlib.compress(rows)) + chunk(b"IEND", b"")
 
 
-def test_colour_png_of_sixteen_bits(tmp_path, pixels):
+def test_color_png_of_sixteen_bits(tmp_path, pixels):
     deep = (pixels.astype(np.uint16) * 256 + 77).astype(">u2")
     rows = b"".join(b"\0" + row.tobytes() for row in deep)
     path = tmp_path / "deep.png"
@@ -188,7 +188,7 @@ def test_colour_png_of_sixteen_bits(tmp_path, pixels):
     ("dtype", "factor", "count"),
     [("uint16", 257, 3), ("float32", 1 / 255, 3), ("float32", 1, 3), ("uint16", 257, 5)],
 )
-def test_tiffs_of_many_bits_in_colour(tmp_path, pixels, dtype, factor, count):
+def test_tiffs_of_many_bits_in_color(tmp_path, pixels, dtype, factor, count):
     rasterio = pytest.importorskip("rasterio")
     path = tmp_path / "deep.tif"
     bands = np.moveaxis(pixels, 2, 0).astype(float) * factor

@@ -43,7 +43,7 @@ def ground(east, north):
 
 
 def paint(east, north):
-    """Smooth colours (..., 3)."""
+    """Smooth colors (..., 3)."""
     x, y = east - WEST, north - NORTH
     channels = [128 + 90 * np.sin(0.2 * x), 128 + 90 * np.cos(0.25 * y), 100 + 0.5 * x]
     return np.rint(np.stack(channels, axis=-1)).astype(np.uint8)
@@ -549,7 +549,7 @@ def pair(tmp_path: Path) -> Survey:
 )
 @pytest.mark.parametrize("scale", [1.0, 1.01])
 def test_rewrite_moves_the_surface(tmp_path, turn, scale):
-    """Each new cell's place, moved back, lies on the old surface and has the old colour."""
+    """Each new cell's place, moved back, lies on the old surface and has the old color."""
     survey = pair(tmp_path)
     transform = Transform(turn, scale, [13.37, -8.71, 1.25], survey.centre)
     paths = []
@@ -566,7 +566,7 @@ def test_rewrite_moves_the_surface(tmp_path, turn, scale):
     assert np.abs(miss[inner]).max() < 0.015  # bilinear in 0.5 m cells
     assert abs(miss[inner].mean()) < 0.002
     assert abs(inner.sum() * 0.25 / (58 * 38 * scale**2) - 1) < 0.03
-    # Colours lie where the surface under them has gone.
+    # Colors lie where the surface under them has gone.
     grid = found.color_grid
     rows, cols = np.nonzero(found.color_valid)
     east, north = grid.east_north(rows, cols)

@@ -17,14 +17,14 @@ from meshreg.io import read_survey, require_writable, rewrite_survey
 from meshreg.io.files.naming import planned
 from meshreg.records import SourceFile, Survey, Transform
 
-COLOURS = [(250, 10, 20), (30, 240, 50), (60, 70, 230)]
+COLORS = [(250, 10, 20), (30, 240, 50), (60, 70, 230)]
 MOVE = Transform(offset=np.array([1.0, 2.0, 0.5]))
 
 
 def obj_tile(folder, number, page="texture.jpg", library="model.mtl", options=""):
-    """Write model.obj, its MTL and page, all of one colour, 10 m on from the last."""
+    """Write model.obj, its MTL and page, all of one color, 10 m on from the last."""
     folder.mkdir(parents=True, exist_ok=True)
-    Image.new("RGB", (8, 8), COLOURS[number]).save(folder / page, quality=100)
+    Image.new("RGB", (8, 8), COLORS[number]).save(folder / page, quality=100)
     (folder / library).write_text(f"newmtl skin\nKd 1 1 1\nmap_Kd {options}{page}\n")
     east = 10 * number
     corners = [(0, 0, 0), (10, 0, 1), (10, 10, 0.5), (0, 10, 2)]
@@ -35,13 +35,13 @@ def obj_tile(folder, number, page="texture.jpg", library="model.mtl", options=""
     return folder / "model.obj"
 
 
-def colour_at_centre(path):
-    """Mean colour of a file's one page, as trimesh finds it, and where the middle of it lies."""
+def color_at_centre(path):
+    """Mean color of a file's one page, as trimesh finds it, and where the middle of it lies."""
     mesh = trimesh.load(path, process=False, force="mesh")
     material = mesh.visual.material
     image = getattr(material, "image", None) or material.baseColorTexture
-    colour = np.asarray(image.convert("RGB"), float).mean(axis=(0, 1))
-    return colour, mesh.bounds.mean(axis=0)
+    color = np.asarray(image.convert("RGB"), float).mean(axis=(0, 1))
+    return color, mesh.bounds.mean(axis=0)
 
 
 @pytest.mark.parametrize("page", ["texture.jpg", "the page.jpg", "Å/seite.jpg"])
@@ -66,10 +66,10 @@ def test_tiles_whose_files_are_called_alike(tmp_path, page, options):
     moved = read_survey(objs)
     for number, path in enumerate(objs):
         pages = [texture.load().mean(axis=(0, 1)) for texture in moved.geometry.textures]
-        assert pages[number] == pytest.approx(COLOURS[number], abs=2)
+        assert pages[number] == pytest.approx(COLORS[number], abs=2)
         if " " not in page and not options:  # trimesh takes a name to end at the first blank
-            colour, centre = colour_at_centre(path)
-            assert colour == pytest.approx(COLOURS[number], abs=2)
+            color, centre = color_at_centre(path)
+            assert color == pytest.approx(COLORS[number], abs=2)
             assert centre == pytest.approx([10 * number + 6, 7, 1.5])
     # the bytes of what is not named differently stay
     first = (tmp_path / "tile_0" / "model.obj").read_text().splitlines()
@@ -82,7 +82,7 @@ def test_tiles_whose_files_are_called_alike(tmp_path, page, options):
 def test_a_page_that_all_tiles_share_is_written_once(tmp_path):
     for number in range(2):
         obj_tile(tmp_path / f"tile_{number}", number)
-        Image.new("RGB", (8, 8), COLOURS[0]).save(tmp_path / f"tile_{number}" / "texture.jpg")
+        Image.new("RGB", (8, 8), COLORS[0]).save(tmp_path / f"tile_{number}" / "texture.jpg")
     files = rewrite_survey(read_survey(tmp_path), MOVE, tmp_path / "out")
     assert sorted(path.name for path in files) == [
         "model.mtl",
@@ -102,14 +102,14 @@ def test_tiles_in_one_folder_that_share_a_material_file(tmp_path):
     assert len(files) == 4
     assert not (tmp_path / "out" / "moving_ortho.tif").exists()
     for name in ("a_registered.obj", "b_registered.obj"):
-        assert colour_at_centre(tmp_path / "out" / name)[0] == pytest.approx(COLOURS[2], abs=2)
+        assert color_at_centre(tmp_path / "out" / name)[0] == pytest.approx(COLORS[2], abs=2)
 
 
 def test_plys_and_their_pages(tmp_path):
     for number in range(2):
         folder = tmp_path / f"tile {number}"
         folder.mkdir()
-        Image.new("RGB", (8, 8), COLOURS[number]).save(folder / "page one.png")
+        Image.new("RGB", (8, 8), COLORS[number]).save(folder / "page one.png")
         rows = [f"{10 * number + x} {y} 0" for x, y in ((0, 0), (10, 0), (10, 10))]
         head = ["ply", "format ascii 1.0", "comment TextureFile page one.png", "comment page one"]
         head += ["element vertex 3", *(f"property double {axis}" for axis in "xyz")]
@@ -124,7 +124,7 @@ def test_plys_and_their_pages(tmp_path):
         name = head[2].removeprefix("comment TextureFile ")
         assert head[3] == "comment page one"
         with Image.open(path.parent / name) as image:
-            assert image.convert("RGB").getpixel((3, 3)) == COLOURS[number]
+            assert image.convert("RGB").getpixel((3, 3)) == COLORS[number]
 
 
 def test_gltfs_and_their_files(tmp_path):
@@ -135,7 +135,7 @@ def test_gltfs_and_their_files(tmp_path):
         points = np.array([[east, 0, 0], [east + 10, 0, 0], [east, 1, -10]], np.float32)
         data = points.astype("<f4").tobytes() + np.array([[0, 0], [1, 0], [0, 1]], "<f4").tobytes()
         (folder / "a b.bin").write_bytes(data)
-        Image.new("RGB", (8, 8), COLOURS[number]).save(folder / "page#1.png")
+        Image.new("RGB", (8, 8), COLORS[number]).save(folder / "page#1.png")
         views = [
             {"buffer": 0, "byteOffset": 0, "byteLength": 36},
             {"buffer": 0, "byteOffset": 36, "byteLength": 24},
@@ -167,7 +167,7 @@ def test_gltfs_and_their_files(tmp_path):
         page = path.parent / unquote(tree["images"][0]["uri"])
         assert page in files
         with Image.open(page) as image:
-            assert image.getpixel((0, 0)) == COLOURS[number]
+            assert image.getpixel((0, 0)) == COLORS[number]
         data = (path.parent / unquote(tree["buffers"][0]["uri"])).read_bytes()
         assert np.frombuffer(data[:4], "<f4")[0] == 10 * number
 

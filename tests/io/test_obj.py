@@ -40,7 +40,7 @@ def file(tmp_path):
 
 @pytest.fixture
 def pages(tmp_path):
-    """Return a function that makes texture pages of one colour each."""
+    """Return a function that makes texture pages of one color each."""
 
     def make(*names):
         for number, name in enumerate(names):
@@ -177,14 +177,14 @@ def test_the_corners_of_polygons_keep_their_texture(file, pages):
         ),
     ],
 )
-def test_colours_of_vertices(file, lines, expected):
+def test_colors_of_vertices(file, lines, expected):
     np.testing.assert_array_equal(opened(file(lines + "f 1 2 3\n")).geometry.colors, expected)
 
 
-def test_colours_of_some_vertices_are_not_completed(file):
+def test_colors_of_some_vertices_are_not_completed(file):
     survey = opened(file("v 0 0 0 1 1 1\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"))
     assert survey.geometry.colors is None
-    assert "Only 1 of 3 vertices have a colour" in notes_of(survey)
+    assert "Only 1 of 3 vertices have a color" in notes_of(survey)
 
 
 def test_weights_are_left_out(file):
@@ -552,7 +552,7 @@ def test_a_page_that_is_no_image_counts_as_missing(file, tmp_path):
     assert "'a.png'" in notes_of(survey)
 
 
-def test_colours_stay_where_the_texture_is_missing(file):
+def test_colors_stay_where_the_texture_is_missing(file):
     text = SQUARE.replace("\n", " 1 0 0\n") + "usemtl m\nf 1 2 3\n"
     survey = opened(file("mtllib gone.mtl\n" + text))
     assert (survey.geometry.colors == [255, 0, 0]).all()

@@ -61,11 +61,11 @@ def grid_mesh(rows, cols, seed=0, **parts):
     rows=st.integers(2, 9),
     seed=st.integers(0, 2**31),
     pages=st.integers(0, 3),
-    coloured=st.booleans(),
+    colored=st.booleans(),
     size=st.sampled_from([1e-3, 1.0, 300.0, 1e5]),
     origin=st.sampled_from([(0, 0, 0), (731000, 5705000, -12), (-3.5, 0, 0)]),
 )
-def test_what_is_written_is_read_back(tmp_path, rows, seed, pages, coloured, size, origin):
+def test_what_is_written_is_read_back(tmp_path, rows, seed, pages, colored, size, origin):
     rng = np.random.default_rng(seed)
     sheet = grid_mesh(rows, 4, seed)
     n_faces = len(sheet.faces)
@@ -78,7 +78,7 @@ def test_what_is_written_is_read_back(tmp_path, rows, seed, pages, coloured, siz
     mesh = Mesh(
         sheet.vertices * size,
         sheet.faces,
-        rng.integers(0, 256, (len(sheet.vertices), 3), np.uint8) if coloured else None,
+        rng.integers(0, 256, (len(sheet.vertices), 3), np.uint8) if colored else None,
         uv,
         face_texture,
         tuple(texture_from_array(shade) for shade in shades),
@@ -95,7 +95,7 @@ def test_what_is_written_is_read_back(tmp_path, rows, seed, pages, coloured, siz
     step = min(1e-6, 1e-8 * np.ptp(mesh.vertices, axis=0).max() * 10)
     assert np.abs(absolute(again) - absolute(survey)).max() <= step / 2 + 1e-9 * (origin[1] > 1e6)
     np.testing.assert_array_equal(again.geometry.faces, mesh.faces)
-    if coloured:
+    if colored:
         np.testing.assert_array_equal(again.geometry.colors, mesh.colors)
     else:
         assert again.geometry.colors is None

@@ -38,8 +38,8 @@ def absolute(survey):
     return survey.geometry.points + survey.origin
 
 
-def page(path, colour):
-    Image.new("RGB", (4, 4), colour).save(path)
+def page(path, color):
+    Image.new("RGB", (4, 4), color).save(path)
     return path
 
 
@@ -203,13 +203,13 @@ def textured(n_pages, numbers, uv=((0, 0, 1, 0, 1, 1), (0, 0, 1, 1, 0, 1))):
 @pytest.mark.parametrize("order", ["", "<", ">"])
 def test_several_pages_by_texnumber(tmp_path, order):
     elements, comments = textured(3, (2, 1))
-    colours = [(255, 0, 0), (0, 255, 0), (0, 0, 255)]
-    pages = [page(tmp_path / f"page {k}.png", colours[k]) for k in range(3)]
+    colors = [(255, 0, 0), (0, 255, 0), (0, 0, 255)]
+    pages = [page(tmp_path / f"page {k}.png", colors[k]) for k in range(3)]
     path = ply(tmp_path / "a.ply", elements, order=order, comments=comments)
     survey = read(path, ReadOptions())
     mesh = survey.geometry
     assert mesh.face_texture.tolist() == [2, 1]
-    assert [tuple(t.load()[0, 0]) for t in mesh.textures] == colours
+    assert [tuple(t.load()[0, 0]) for t in mesh.textures] == colors
     assert mesh.uv.reshape(2, 6).tolist() == [[0, 0, 1, 0, 1, 1], [0, 0, 1, 1, 0, 1]]
     assert survey.source[0].companions == tuple(pages)
     bare = read(path, ReadOptions(geometry_only=True)).geometry
@@ -249,7 +249,7 @@ def test_texture_coordinates_per_vertex(tmp_path, names):
     assert mesh.face_texture.tolist() == [0, 0]
 
 
-def test_missing_and_broken_pages_take_the_colour_of_their_faces(tmp_path):
+def test_missing_and_broken_pages_take_the_color_of_their_faces(tmp_path):
     elements, comments = textured(3, (0, 2))
     (tmp_path / "page 1.png").write_bytes(b"no picture")
     page(tmp_path / "PAGE 2.png", (5, 5, 5))
@@ -903,7 +903,7 @@ def test_faces_without_a_list_of_vertices_are_refused(tmp_path, face, row):
         read(ply(tmp_path / "a.ply", elements), ReadOptions())
 
 
-def test_texcoord_that_is_no_list_and_colours_of_faces(tmp_path):
+def test_texcoord_that_is_no_list_and_colors_of_faces(tmp_path):
     page(tmp_path / "p.png", (1, 1, 1))
     face = [INDICES, ("texcoord", "float"), ("red", "uchar")]
     elements = [("vertex", XYZ, SQUARE), ("face", face, [[[0, 1, 2], 0.5, 9]])]
@@ -911,7 +911,7 @@ def test_texcoord_that_is_no_list_and_colours_of_faces(tmp_path):
     with pytest.raises(InputError, match="'texcoord' that is not a list"):
         read(path, ReadOptions())
     survey = read(path, ReadOptions(geometry_only=True))
-    assert "Colours of faces are not used" in survey.notes[0]
+    assert "Colors of faces are not used" in survey.notes[0]
 
 
 @pytest.mark.parametrize("order", ["", "<"])

@@ -177,8 +177,8 @@ def test_plain_spellings(text):
         (np.array([[0, 7, 255]], np.uint16), [0, 7, 255], "8-bit values in 16-bit fields"),
         (np.array([[0, 0.5, 1]], np.float32), [0, 128, 255], ""),
         (np.array([[0, 100.4, 255]], np.float64), [0, 100, 255], "taken as 0-255"),
-        (np.array([[0, -3, 300]], np.int32), [0, 0, 255], "1 colours outside"),
-        (np.array([[0, np.nan, 1]], np.float32), [0, 0, 255], "1 colours that are not finite"),
+        (np.array([[0, -3, 300]], np.int32), [0, 0, 255], "1 colors outside"),
+        (np.array([[0, np.nan, 1]], np.float32), [0, 0, 255], "1 colors that are not finite"),
     ],
 )
 def test_colors_of_any_type(values, expected, told):

@@ -196,7 +196,7 @@ def test_broken_off(tmp_path, head, body, message):
 def test_off_with_comments_colors_quads_and_colored_faces(tmp_path):
     body = "# four corners\n0 0 0.5 9 0 0 255\n4 0 0.25 0 9 0 255 # east\n\n"
     body += "4 3 0 0 0 9 255\n0 3 1 255 255 255 255\n4 0 1 2 3 1 0 0\n2 0 1\n"
-    path = made_off(tmp_path / "a.off", body, "COFF # colours\n4 2 5\n")
+    path = made_off(tmp_path / "a.off", body, "COFF # colors\n4 2 5\n")
     survey = off.read(path, ReadOptions())
     assert survey.geometry.colors.tolist() == [[9, 0, 0], [0, 9, 0], [0, 0, 9], [255] * 3]
     np.testing.assert_array_equal(survey.geometry.faces, FACES)

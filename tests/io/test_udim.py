@@ -11,7 +11,7 @@ from meshreg.io.obj.udim import first_tile, has_token, tile_pages
 from meshreg.raster import rasterize
 from meshreg.records import Grid, Transform
 
-COLOURS = {(0, 0): (250, 10, 20), (1, 0): (30, 240, 50), (3, 1): (60, 70, 230)}
+COLORS = {(0, 0): (250, 10, 20), (1, 0): (30, 240, 50), (3, 1): (60, 70, 230)}
 NAMES = {
     "udim": ("skin.<UDIM>.png", lambda u, v: f"skin.{1001 + u + 10 * v}.png"),
     "first": ("skin.1001.png", lambda u, v: f"skin.{1001 + u + 10 * v}.png"),
@@ -22,7 +22,7 @@ NAMES = {
 }
 
 
-def model(folder, named, called, tiles=COLOURS, extra="", east=0.0):
+def model(folder, named, called, tiles=COLORS, extra="", east=0.0):
     """Write an OBJ of 10 m squares in a row, each on a tile of its own; whole tiles are shown."""
     folder.mkdir(parents=True, exist_ok=True)
     lines, faces = ["mtllib reef.mtl", "usemtl skin"], []
@@ -35,7 +35,7 @@ def model(folder, named, called, tiles=COLOURS, extra="", east=0.0):
         faces += [f"f {a}/{a} {a + 1}/{a + 1} {a + 2}/{a + 2} {a + 3}/{a + 3}"]
         path = folder / called(u, v)
         path.parent.mkdir(exist_ok=True)
-        # not of one colour throughout, which counts as no texture
+        # not of one color throughout, which counts as no texture
         rough = np.random.default_rng(1).integers(-5, 6, (64, 64, 3))
         Image.fromarray(np.clip(tiles[u, v] + rough, 0, 255).astype(np.uint8)).save(path)
     (folder / "reef.mtl").write_text(f"newmtl skin\nKd 1 1 1\nmap_Kd {named}\n{extra}")
@@ -43,7 +43,7 @@ def model(folder, named, called, tiles=COLOURS, extra="", east=0.0):
     return folder / "reef.obj"
 
 
-def colours_seen(survey, east=0.0):
+def colors_seen(survey, east=0.0):
     grid = Grid(east, 10.0, 1.0, (10, 30))
     raster = rasterize(survey, grid)
     return [raster.color[2:8, 10 * k + 2 : 10 * k + 8].reshape(-1, 3) for k in range(3)]
@@ -54,21 +54,19 @@ def test_each_tile_has_its_own_page(tmp_path, kind):
     path = model(tmp_path / "in", *NAMES[kind])
     survey = read_survey(path)
     assert len(survey.geometry.textures) == 3
-    for seen, colour in zip(colours_seen(survey), COLOURS.values(), strict=True):
-        assert np.abs(seen.astype(int) - colour).max() <= 6
+    for seen, color in zip(colors_seen(survey), COLORS.values(), strict=True):
+        assert np.abs(seen.astype(int) - color).max() <= 6
     files = rewrite_survey(survey, Transform(offset=np.array([100.0, 0, 0])), tmp_path / "out")
     assert {file.suffix for file in files} == {".obj", ".mtl", ".png"}
     assert len(files) == 5  # all pages are there, as many as were
-    for seen, colour in zip(
-        colours_seen(read_survey(files[0]), 100), COLOURS.values(), strict=True
-    ):
-        assert np.abs(seen.astype(int) - colour).max() <= 6
+    for seen, color in zip(colors_seen(read_survey(files[0]), 100), COLORS.values(), strict=True):
+        assert np.abs(seen.astype(int) - color).max() <= 6
 
 
 def test_tiles_of_folders_with_pages_of_the_same_names(tmp_path):
     """The second folder has a page more than the first, and all are renamed alike."""
-    shades = {tile: tuple(255 - c for c in colour) for tile, colour in COLOURS.items()}
-    first = {tile: COLOURS[tile] for tile in ((0, 0), (1, 0))}
+    shades = {tile: tuple(255 - c for c in color) for tile, color in COLORS.items()}
+    first = {tile: COLORS[tile] for tile in ((0, 0), (1, 0))}
     for named, called in (NAMES["udim"], NAMES["first"]):
         where = tmp_path / named.strip("<>").replace("<", "").replace(">", "")
         model(where / "a", named, called, first)
@@ -76,8 +74,8 @@ def test_tiles_of_folders_with_pages_of_the_same_names(tmp_path):
         files = rewrite_survey(read_survey(where), Transform(), where / "out")
         assert len(files) == len(set(files)) == 2 + 2 + 5
         again = read_survey([file for file in files if file.suffix == ".obj"])
-        for seen, colour in zip(colours_seen(again, 100), shades.values(), strict=True):
-            assert np.abs(seen.astype(int) - colour).max() <= 6
+        for seen, color in zip(colors_seen(again, 100), shades.values(), strict=True):
+            assert np.abs(seen.astype(int) - color).max() <= 6
 
 
 def test_a_page_that_is_not_there_leaves_its_tile_bare_and_is_said(tmp_path):

@@ -101,7 +101,7 @@ def test_longitude_and_latitude_become_metres(tmp_path):
     assert not any("EPSG:4326" in note for note in said.notes)
 
 
-# --- colours
+# --- colors
 
 
 @pytest.mark.parametrize(
@@ -129,7 +129,7 @@ def test_longitude_and_latitude_become_metres(tmp_path):
         ),
     ],
 )
-def test_colours(tmp_path, name, rows, colors):
+def test_colors(tmp_path, name, rows, colors):
     path = text(tmp_path / name, "\n".join(rows))
     survey = read_survey(path)
     found = survey.geometry.colors

@@ -111,7 +111,7 @@ ROWS: dict[int, tuple[str, str]] = {
     23: (
         "texture page missing",
         "io/test_obj.py::test_a_missing_page_is_named_and_its_faces_have_none "
-        "io/test_ply.py::test_missing_and_broken_pages_take_the_colour_of_their_faces",
+        "io/test_ply.py::test_missing_and_broken_pages_take_the_color_of_their_faces",
     ),
     24: (
         "case, backslash, spaces in names",
@@ -146,8 +146,8 @@ ROWS: dict[int, tuple[str, str]] = {
     ),
     30: (
         "16-bit and float texture",
-        "io/test_images.py::test_colour_png_of_sixteen_bits "
-        "io/test_images.py::test_tiffs_of_many_bits_in_colour",
+        "io/test_images.py::test_color_png_of_sixteen_bits "
+        "io/test_images.py::test_tiffs_of_many_bits_in_color",
     ),
     31: (
         "CMYK, palette, 1 bit",

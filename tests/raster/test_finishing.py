@@ -55,7 +55,7 @@ def test_fill_of_any_color_is_masked_and_counted(fill, quality, cell):
     assert not (raster.color_valid & inside).any()
     lost = ~raster.color_valid & ~inside
     assert lost.mean() < (0.06 if cell == 0.01 else 0.10)  # the rim of two texels and a cell
-    assert raster.masked["flat colour"] == (~raster.color_valid).sum()
+    assert raster.masked["flat color"] == (~raster.color_valid).sum()
     assert raster.valid.all()  # heights stay
     assert not raster.color[~raster.color_valid].any()
 
@@ -75,7 +75,7 @@ def test_unseen_faces_on_one_texel_are_masked():
     )
     assert not raster.color_valid[121:149, 51:99].any()
     assert raster.color_valid[:115].all()
-    assert raster.masked["flat colour"] == pytest.approx(50 * 30, rel=0.3)
+    assert raster.masked["flat color"] == pytest.approx(50 * 30, rel=0.3)
 
 
 @pytest.mark.parametrize("quality", [None, 90, 60, 30])
@@ -86,7 +86,7 @@ def test_dark_ground_with_noise_stays(quality, cell):
         image = as_jpeg(image, quality)
     count = round(4 / cell)
     raster = rasterize(draped(image, 4.0, 4.0), Grid(0, 4, cell, (count, count)))
-    assert "flat colour" not in raster.masked
+    assert "flat color" not in raster.masked
     assert raster.color_valid.all()
 
 
@@ -98,7 +98,7 @@ def test_overexposed_sand_stays():
     image = np.repeat(np.clip(bright + noise, 0, 255)[..., None], 3, axis=2)
     assert (image == 255).all(axis=2).mean() > 0.02
     raster = rasterize(draped(image, 4.0, 4.0), Grid(0, 4, 0.01, (400, 400)))
-    assert "flat colour" not in raster.masked
+    assert "flat color" not in raster.masked
 
 
 @pytest.mark.parametrize("cell", [0.01, 0.002])
@@ -107,7 +107,7 @@ def test_a_smooth_gradient_stays(cell):
     ramp = np.broadcast_to(np.linspace(20, 60, 400)[:, None, None], (400, 400, 3))
     count = round(2 / cell)
     raster = rasterize(draped(ramp, 4.0, 4.0), Grid(1, 3, cell, (count, count)))
-    assert "flat colour" not in raster.masked
+    assert "flat color" not in raster.masked
 
 
 def test_a_survey_of_one_color_throughout_stays():

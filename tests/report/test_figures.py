@@ -93,7 +93,7 @@ def test_a_figure_that_fails_is_left_out_and_said(
 
 
 def value_at(axes: Any, east: float, north: float) -> Any:
-    """Colour or value of the axes' picture at a place, found through its extent."""
+    """Color or value of the axes' picture at a place, found through its extent."""
     image = axes.images[0]
     west, right, south, top = image.get_extent()
     array = image.get_array()
@@ -248,12 +248,12 @@ def test_cross_section_shows_absolute_heights(accepted: Registration) -> None:
 
 def test_overlay_is_grey_only_where_both_agree(accepted: Registration) -> None:
     figure = overlays.draw_relief(accepted)
-    colour = [
+    color = [
         np.ptp(axes.images[0].get_array()[60:-40, 60:-40].astype(int), axis=-1).mean()
         for axes in figure.axes
     ]
     assert [axes.get_title() for axes in figure.axes] == ["before", "after"]
-    assert colour[1] < 0.1 * colour[0]
+    assert color[1] < 0.1 * color[0]
 
 
 def test_extents_are_the_boxes_of_the_record(accepted: Registration) -> None:
@@ -277,7 +277,7 @@ def test_extents_are_the_boxes_of_the_record(accepted: Registration) -> None:
 # ---- the parts --------------------------------------------------------------------------------
 
 
-def test_two_tone_colours() -> None:
+def test_two_tone_colors() -> None:
     bright, dark, none = 1.0, 0.0, math.nan
     reference = np.array([[bright, bright, dark, bright, none, none]])
     moving = np.array([[bright, dark, bright, none, bright, none]])

@@ -109,7 +109,7 @@ def test_ripples_change_the_sand_alone():
     assert 0.001 < np.abs(rise[differs]).mean() < 0.05
 
 
-def test_texture_changes_colour_everywhere_and_relief_by_the_size_of_rubble():
+def test_texture_changes_color_everywhere_and_relief_by_the_size_of_rubble():
     scene = scene_with(texture=0.7)
     _, _, rise, differs = sampled(scene)
     assert np.abs(rise).max() < 0.06

@@ -101,8 +101,8 @@ def test_same_seed_same_bytes(kind, tmp_path):
     assert digests[0][f"reference{FORMATS[kind]}"] != digests[2][f"reference{FORMATS[kind]}"]
 
 
-def test_texture_shows_the_colour_at_its_place():
-    """Each face's texture, at its corners, is the vertex colour of the other kind of mesh."""
+def test_texture_shows_the_color_at_its_place():
+    """Each face's texture, at its corners, is the vertex color of the other kind of mesh."""
     textured = make_pair(recipe(), 5, SIZE, "obj").moving.geometry
     colored = make_pair(recipe(), 5, SIZE, "ply").moving.geometry
     np.testing.assert_array_equal(textured.vertices, colored.vertices)

@@ -89,7 +89,7 @@ def read(path: Path, options: ReadOptions) -> Survey:
         raise
     colors = model.colors[kept]
     if not colors.any():
-        notes.append("All points are black: the model holds no colours.")
+        notes.append("All points are black: the model holds no colors.")
     for note in notes:
         log.warning("%s: %s", path.name, note)
     source = SourceFile(

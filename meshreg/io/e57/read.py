@@ -62,7 +62,7 @@ def read(path: Path, options: ReadOptions) -> Survey:
     Returns
     -------
     Survey
-        With a PointCloud; colours scaled to 8 bits where the file's range is another, present
+        With a PointCloud; colors scaled to 8 bits where the file's range is another, present
         when every scan has them.
 
     Raises
@@ -132,9 +132,9 @@ def _read_scans(
     with_color = [part for part in colors if part is not None]
     every = len(with_color) == len(colors) and not geometry_only
     if every and any(color_range(scan)[1] > 255 for scan in layout.scans):
-        notes.append("Colours of more than 8 bits were scaled to 8.")
+        notes.append("Colors of more than 8 bits were scaled to 8.")
     if with_color and not every and not geometry_only:
-        notes.append("Colours were left out, because not every scan has them.")
+        notes.append("Colors were left out, because not every scan has them.")
     xyz, rgb = np.concatenate(points), np.concatenate(with_color) if every else None
     ground = ground_classes(np.concatenate(classes), notes)
     if ground is None:
@@ -162,9 +162,9 @@ def _direction_notes(layout: Layout) -> tuple[str, ...]:
 def rewrite(source: SourceFile, move: Mover, path: Path) -> tuple[Path, ...]:
     """Write a moved copy of an E57 file.
 
-    A rigid move composes each scan's and image's pose with it: points, colours, pictures and
+    A rigid move composes each scan's and image's pose with it: points, colors, pictures and
     extensions keep their bytes. Any other move writes the points anew, one scan for each, with
-    colour, intensity and normal.
+    color, intensity and normal.
 
     Parameters
     ----------
@@ -191,7 +191,7 @@ def rewrite(source: SourceFile, move: Mover, path: Path) -> tuple[Path, ...]:
             if normal and (note := bend_note(find_directions(NORMALS), move)):
                 warn(path, note)
             log.warning(
-                "%s: the move is not rigid; pictures and fields other than colour, intensity and "
+                "%s: the move is not rigid; pictures and fields other than color, intensity and "
                 "normal are left out.",
                 path,
             )

@@ -24,7 +24,7 @@ SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
 COLORS = ("colorRed", "colorGreen", "colorBlue")
 NORMALS = ("nor:normalX", "nor:normalY", "nor:normalZ")
 _NORMALS_URI = "http://www.libe57.org/E57_EXT_surface_normals.txt"
-_FIELDS = 12  # asked for at once, at most: coordinates, state, colours, intensity, normal, class
+_FIELDS = 12  # asked for at once, at most: coordinates, state, colors, intensity, normal, class
 
 
 class MissingLibraryError(MeshregError):
@@ -142,7 +142,7 @@ def rotation_matrix(quaternion: Float64) -> Float64:
 
 
 def color_range(scan: Entry) -> tuple[float, float]:
-    """Return the declared range of the colours: the scan's limits, else the fields' own."""
+    """Return the declared range of the colors: the scan's limits, else the fields' own."""
     low = [scan.limits.get(name + "Minimum") for name in COLORS]
     high = [scan.limits.get(name + "Maximum") for name in COLORS]
     fields = [scan.fields[name] for name in COLORS if name in scan.fields]

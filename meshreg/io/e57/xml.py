@@ -27,7 +27,7 @@ from meshreg.io.e57.pages import (
 from meshreg.io.files.safe import open_regular, require_proportion
 from meshreg.records import Float64
 
-_PER_POINT = 100  # bytes of memory: coordinates, colours, and copies of them
+_PER_POINT = 100  # bytes of memory: coordinates, colors, and copies of them
 MAX_DEPTH = 64
 
 

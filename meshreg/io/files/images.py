@@ -99,7 +99,7 @@ def open_texture(
 ) -> Texture:
     """Open a texture page by its header: JPEG, PNG, TIFF or WebP, told by the first bytes.
 
-    When its `load` is called: 16-bit values are divided by 257 (by 256 where Pillow reads colour
+    When its `load` is called: 16-bit values are divided by 257 (by 256 where Pillow reads color
     PNG and TIFF), float values are multiplied by 255 where none is above 1; grey, palette, 1-bit
     and CMYK pages become RGB, and transparency a fourth channel.
 

@@ -1,4 +1,4 @@
-"""The primitives of a glTF scene, each in place: points, triangles, colours, coordinates."""
+"""The primitives of a glTF scene, each in place: points, triangles, colors, coordinates."""
 
 from __future__ import annotations
 

@@ -46,7 +46,7 @@ def read(path: Path, options: ReadOptions) -> Survey:
     Returns
     -------
     Survey
-        Colours of vertices are taken as stored; texture coordinates are turned from glTF's v
+        Colors of vertices are taken as stored; texture coordinates are turned from glTF's v
         downward to v upward.
 
     Raises
@@ -91,7 +91,7 @@ def _joined(path: Path, parts: list[Part], pages: Pages, notes: Notes) -> RawGeo
     if any(part.colors is not None for part in parts):
         bare = sum(part.colors is None for part in parts)
         if bare:
-            notes.texts.append(f"{bare} of {len(parts)} primitives have no colours; left white.")
+            notes.texts.append(f"{bare} of {len(parts)} primitives have no colors; left white.")
         white = [np.full((len(part.points), 3), 255, np.uint8) for part in parts]
         chosen = zip(parts, white, strict=True)
         colors = np.concatenate([p.colors if p.colors is not None else w for p, w in chosen])

@@ -85,7 +85,7 @@ class Pages:
             "source", texture.get("source")
         )
         if source is None:
-            self._notes.append(f"{place} has no image of a kind that is read; it gives no colour.")
+            self._notes.append(f"{place} has no image of a kind that is read; it gives no color.")
             return -1
         clamp = False
         if texture.get("sampler") is not None:
@@ -97,7 +97,7 @@ class Pages:
         try:
             name, where = self._image(source, place)
         except MissingReferenceError as error:
-            self._notes.append(f"The image of {place} gives no colour: {error.message}")
+            self._notes.append(f"The image of {place} gives no color: {error.message}")
             return -1
         most = self._options.max_pixels
         try:
@@ -106,7 +106,7 @@ class Pages:
             else:
                 page = open_texture_bytes(where, name, most, clamp, self._notes)
         except InputError as error:
-            self._notes.append(f"The image of {place} {error.message} It gives no colour.")
+            self._notes.append(f"The image of {place} {error.message} It gives no color.")
             return -1
         self.textures.append(page)
         return len(self.textures) - 1
@@ -130,7 +130,7 @@ class Pages:
 
 
 def _color_texture(material: dict[str, Any]) -> dict[str, Any] | None:
-    """Return the reference to the texture that gives a material its colour, or None."""
+    """Return the reference to the texture that gives a material its color, or None."""
     for info in (
         _object(material.get("pbrMetallicRoughness")).get("baseColorTexture"),
         _object(extension(material, "KHR_materials_pbrSpecularGlossiness")).get("diffuseTexture"),

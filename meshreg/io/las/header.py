@@ -21,7 +21,7 @@ from meshreg.io.frames.crs import crs_text, metres_per_unit, parse_crs, with_ver
 from meshreg.io.las.laz_chunks import DAMAGED, Vlr, check_chunks
 
 _SIZES = {0: 227, 1: 227, 2: 227, 3: 235, 4: 375, 5: 393}  # by minor version
-_PER_POINT = 80  # bytes of memory: steps, coordinates, colours, and copies of them
+_PER_POINT = 80  # bytes of memory: steps, coordinates, colors, and copies of them
 _RECORDS = (20, 28, 26, 34, 57, 63, 30, 36, 38, 59, 67)  # by point format
 _LINEAR_UNITS = {9001: 1.0, 9002: 0.3048, 9003: 1200 / 3937}  # GeoTIFF codes
 _ODD = "Its coordinates were taken as a local frame."

@@ -45,7 +45,7 @@ def read(path: Path, options: ReadOptions) -> Survey:
     Returns
     -------
     Survey
-        With a PointCloud; colours as 8 bits, None where the file has none or all are zero.
+        With a PointCloud; colors as 8 bits, None where the file has none or all are zero.
 
     Raises
     ------
@@ -102,7 +102,7 @@ def chunk_points(record: int) -> int:
 def _read_points(
     reader: Any, path: Path, head: LasHead, geometry_only: bool
 ) -> tuple[NDArray[np.int32], NDArray[np.uint16] | None, dict[str, int]]:
-    """Return raw coordinates (N, 3), raw colours (N, 3) or None, and counts of what was dropped."""
+    """Return raw coordinates (N, 3), raw colors (N, 3) or None, and counts of what was dropped."""
     names = set(reader.header.point_format.dimension_names)
     colored = {"red", "green", "blue"} <= names and not geometry_only
     steps: list[NDArray[np.int32]] = []
@@ -190,8 +190,8 @@ def _sidecar_says_unit(path: Path) -> bool:
 
 
 def _eight_bit(colors: NDArray[np.uint16], notes: list[str]) -> UInt8:
-    """Turn 16-bit colours into 8 bits; values that never exceed 255 are 8-bit already."""
+    """Turn 16-bit colors into 8 bits; values that never exceed 255 are 8-bit already."""
     if int(colors.max()) <= 255:
-        notes.append("Colours have 8-bit values in 16-bit fields; they were taken as 0-255.")
+        notes.append("Colors have 8-bit values in 16-bit fields; they were taken as 0-255.")
         return colors.astype(np.uint8)
     return ((colors.astype(np.uint32) + 128) // 257).astype(np.uint8)

@@ -34,7 +34,7 @@ _WAVEFORMS = 65535  # record of the waveform packets
 def write(survey: Survey, path: Path) -> tuple[Path, ...]:
     """Write a point cloud as LAS 1.4 (LAZ by suffix) in absolute coordinates.
 
-    Point format 7 with colours, 6 without; steps of 0.0001 m from the centre of the bounds; the
+    Point format 7 with colors, 6 without; steps of 0.0001 m from the centre of the bounds; the
     CRS as WKT. Opened again and compared.
 
     Raises

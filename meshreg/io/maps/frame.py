@@ -68,7 +68,7 @@ def level_of(raw: RawMap) -> float:
 
 
 def is_height(raw: RawMap) -> bool:
-    """Whether a raster holds heights (else colours)."""
+    """Whether a raster holds heights (else colors)."""
     return raw.values.ndim == 2
 
 

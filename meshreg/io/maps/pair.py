@@ -83,7 +83,7 @@ def read_pair(dem: Path, ortho: Path | None, options: ReadOptions) -> Survey:
     dem : Path
         GeoTIFF of heights; the first band counts.
     ortho : Path or None
-        GeoTIFF of colours, in any CRS; it goes to the DEM's.
+        GeoTIFF of colors, in any CRS; it goes to the DEM's.
     options : ReadOptions
 
     Returns

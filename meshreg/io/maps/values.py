@@ -191,7 +191,7 @@ def read_color(path: Path, max_pixels: int) -> RawMap:
     Raises
     ------
     InputError
-        Not a GeoTIFF, damaged, not georeferenced, or of numbers that are no colours.
+        Not a GeoTIFF, damaged, not georeferenced, or of numbers that are no colors.
     ResourceLimitError
         More than `max_pixels`.
     """
@@ -227,7 +227,7 @@ def read_color(path: Path, max_pixels: int) -> RawMap:
     if undeclared and mask is None and beside is None:
         _drop_undeclared_color(colors, valid, notes)
     if not valid.any():
-        raise InputError("holds no colour: every pixel is masked.", file=path, remedy=EXPORT)
+        raise InputError("holds no color: every pixel is masked.", file=path, remedy=EXPORT)
     colors[~valid] = 0
     return RawMap(path, colors, valid, matrix, crs, "", tuple(notes), local, tags)
 
@@ -264,12 +264,12 @@ def _color_factor(dataset: Any, bands: list[int], path: Path, notes: list[str]) 
         full = float(next((2**n - 1 for n in (8, 10, 12, 14, 16) if highest < 2**n), math.nan))
     if math.isnan(full):
         raise InputError(
-            f"holds {dtype} values up to {highest:g}, which are not colours.",
+            f"holds {dtype} values up to {highest:g}, which are not colors.",
             file=path,
             remedy="Export the orthomosaic in 8 or 16 bits a band.",
         )
     if full != 255:
-        notes.append(f"Colours of 0 to {full:g} were scaled to 0 to 255.")
+        notes.append(f"Colors of 0 to {full:g} were scaled to 0 to 255.")
     return 255.0 / full
 
 

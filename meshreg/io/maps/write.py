@@ -55,7 +55,7 @@ def write_color(
     local: str | None = None,
     tags: Mapping[str, str] | None = None,
 ) -> None:
-    """Write colours (H, W, 3) uint8 with an alpha band that is 255 where `valid` (H, W), else 0.
+    """Write colors (H, W, 3) uint8 with an alpha band that is 255 where `valid` (H, W), else 0.
 
     `local` and `tags` as for `write_height`.
 

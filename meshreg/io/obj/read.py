@@ -121,8 +121,8 @@ def _colors(found: Scan, notes: list[str]) -> UInt8 | None:
     if found.colors is None:
         if found.counts["colored"]:
             notes.append(
-                f"Only {found.counts['colored']} of {len(found.points)} vertices have a colour; "
-                "all vertex colours were left out."
+                f"Only {found.counts['colored']} of {len(found.points)} vertices have a color; "
+                "all vertex colors were left out."
             )
         return None
     values: Any = found.colors

@@ -44,7 +44,7 @@ def write(survey: Survey, path: Path) -> tuple[Path, ...]:
 
     Six decimals, more for small things: a hundred-millionth of the extent at least. Texture
     pages become ``<stem>_0.png`` and so on (byte for byte where they came from a file), named in
-    ``<stem>.mtl``; colours per vertex follow the coordinates as three numbers from 0 to 1.
+    ``<stem>.mtl``; colors per vertex follow the coordinates as three numbers from 0 to 1.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""READ and WRITE OFF: polygons in text, with colours per vertex as COFF."""
+"""READ and WRITE OFF: polygons in text, with colors per vertex as COFF."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ class _Lines:
         """Return the size of each face and the vertex of each corner, checked."""
         first = np.cumsum(self.sizes) - self.sizes
         sizes = self.faces[first]
-        rest = self.sizes - 1 - sizes  # up to four numbers of colour may follow
+        rest = self.sizes - 1 - sizes  # up to four numbers of color may follow
         good = (sizes == np.floor(sizes)) & (sizes >= 0) & (rest >= 0) & (rest <= 4)
         if not good.all():
             bad = int(np.flatnonzero(~good)[0])
@@ -158,7 +158,7 @@ def _as_stored(colors: Float64) -> NDArray[Any]:
 
 
 def write(survey: Survey, path: Path) -> tuple[Path, ...]:
-    """Write a mesh as OFF, or COFF where it has colours, in absolute coordinates.
+    """Write a mesh as OFF, or COFF where it has colors, in absolute coordinates.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""READ and WRITE STL: triangles without colours, binary or text.
+"""READ and WRITE STL: triangles without colors, binary or text.
 
 An own reader, because the one number that must be checked (84 + 50 n bytes) is the format.
 """

@@ -1,4 +1,4 @@
-"""READ PLY: text and both binary orders, meshes with colours or texture pages, point clouds.
+"""READ PLY: text and both binary orders, meshes with colors or texture pages, point clouds.
 
 Writing and rewriting are in `meshreg.io.ply.write`. An own reader because trimesh (5.2) takes the
 faces of a short text file for vertices, accepts any format word, cannot read binary files that
@@ -91,7 +91,7 @@ def read(path: Path, options: ReadOptions) -> Survey:
         return assemble_survey(path, raw, Found("ply", tuple(notes), (), counts), options)
     counts["faces"] = face.element.count
     if face.element.column("red", "diffuse_red") is not None and colors is None:
-        notes.append("Colours of faces are not used, only those of vertices and textures.")
+        notes.append("Colors of faces are not used, only those of vertices and textures.")
     sizes, corners = _corners(face, len(points))
     triangles = triangulate(points, sizes, corners, path)
     notes += triangles.notes()
@@ -257,7 +257,7 @@ def _open_pages(
             page = resolve_reference(path.parent, name, root=path.parent)
         except MissingReferenceError as error:
             notes.append(
-                f"Texture page {decode_name(name)!r} was not found; its faces have no colour "
+                f"Texture page {decode_name(name)!r} was not found; its faces have no color "
                 f"({error.message})"
             )
             continue
@@ -267,7 +267,7 @@ def _open_pages(
         try:
             textures.append(open_texture(page, options.max_pixels, notes=notes))
         except InputError as error:
-            notes.append(f"Texture page {page.name!r} {error.message} Its faces have no colour.")
+            notes.append(f"Texture page {page.name!r} {error.message} Its faces have no color.")
             continue
         new[number] = len(textures) - 1
     return tuple(textures), tuple(companions), new

@@ -50,7 +50,7 @@ _TEXTURE = re.compile(rb"(\s*comment\s+(?i:texturefile)\s+)(.*?)(\s*)", re.DOTAL
 def write(survey: Survey, path: Path) -> tuple[Path, ...]:
     """Write a survey as binary little-endian PLY with absolute float64 coordinates.
 
-    Colours are written per vertex; texture coordinates per face, with one `comment TextureFile`
+    Colors are written per vertex; texture coordinates per face, with one `comment TextureFile`
     a page (files ``<stem>_000.png`` beside it) and the page's number as `texnumber`.
 
     Parameters

@@ -115,7 +115,7 @@ def _cleaned(
 
 
 def _colors(values: Float64, notes: list[str]) -> UInt8:
-    """Turn colours as written (0-1, 0-255 or 0-65535) into 8 bits."""
+    """Turn colors as written (0-1, 0-255 or 0-65535) into 8 bits."""
     if not np.isnan(values).any() and (values == np.rint(values)).all() and values.min() >= 0:
         if values.max() <= 255:
             return values.astype(np.uint8)
