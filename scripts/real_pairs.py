@@ -227,7 +227,7 @@ def main() -> int:
             corners = pivot + [[dx, dy, 0] for dx in (-150, 150) for dy in (-200, 200)]
             moved = np.array([[*(matrix * tuple(c[:2])), c[2]] for c in corners])
             error = np.hypot(*(found.apply(moved) - corners)[:, :2].T).max()
-            turn = math.degrees(math.atan2(found.rotation[1, 0], found.rotation[0, 0]))
+            turn = math.degrees(found.yaw)
             said += f" yaw {turn:+.3f} scale {found.scale:.4f}, corners within {error:.2f} m"
             wrong += result.verdict == "accepted" and error > 3.0
         print(f"{said} ({spent:.1f} s): {result.reason}", flush=True)

@@ -97,7 +97,7 @@ def of_registration(
     """Return the rows of a pair that went the whole way."""
     answer, transform = None, registration.transform
     if transform is not None:
-        turn = math.atan2(transform.rotation[1, 0], transform.rotation[0, 0])
+        turn = transform.yaw
         covariance = registration.covariance
         if covariance is not None:
             covariance = covariance[np.ix_([0, 1, 5], [0, 1, 5])]

@@ -51,10 +51,10 @@ def _print_offset(registration: Registration, voice: Terminal) -> None:
     names = ("east", "north", "up")
     for name, value, sigma in zip(names, transform.offset.tolist(), sigmas[:3], strict=True):
         table.add_row(f"{name}", f"{value:+.4f} m", _plus_minus(sigma, "m", 4))
-    yaw = math.degrees(math.atan2(transform.rotation[1, 0], transform.rotation[0, 0]))
+    yaw = math.degrees(transform.yaw)
     table.add_row("yaw", f"{yaw:+.4f}°", _plus_minus(math.degrees(sigmas[5]), "°", 4))
-    tilt = math.degrees(math.acos(min(float(transform.rotation[2, 2]), 1.0)))
-    if tilt > 0:
+    tilt = math.degrees(transform.tilt)
+    if tilt >= 5e-5:  # what four decimals show
         table.add_row("tilt", f"{tilt:.4f}°", _plus_minus(math.degrees(max(sigmas[3:5])), "°", 4))
     title = "add to the moving survey"
     if registration.verdict == "review":

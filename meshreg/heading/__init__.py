@@ -17,7 +17,6 @@ from meshreg.heading.turned import (
     Turned,
     turned_as_voted,
     turning,
-    yaw_of,
 )
 from meshreg.heading.voting import (
     PLAIN_RATIO,
@@ -45,5 +44,4 @@ __all__ = [
     "turned_as_voted",
     "turning",
     "vote",
-    "yaw_of",
 ]

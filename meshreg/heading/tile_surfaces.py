@@ -15,7 +15,7 @@ import numpy as np
 from meshreg.offsets import neutral
 from meshreg.offsets.correlate import WORKERS
 from meshreg.raster.grid import cell_offset, coarsened
-from meshreg.records import Bool, Float32, Float64, Grid, OffsetAt, SurveyRaster
+from meshreg.records import Bool, Channel, Float32, Float64, Grid, OffsetAt, SurveyRaster
 from meshreg.statistics import MAD_TO_SIGMA
 
 TILES = 5  # along the patch
@@ -55,7 +55,7 @@ class TileSurfaces:
 def channel_surfaces(
     reference: SurveyRaster,
     moving: SurveyRaster,
-    channel: neutral.Channel,
+    channel: Channel,
     cell: float,
     radius: float,
     turn: float,
@@ -96,7 +96,7 @@ def surfaces_bytes(moving: SurveyRaster, cell: float, radius: float, turn: float
 def surfaces_near(
     reference: SurveyRaster,
     moving: SurveyRaster,
-    channel: neutral.Channel,
+    channel: Channel,
     guess: OffsetAt,
     reach: int,
 ) -> TileSurfaces | None:

@@ -24,11 +24,6 @@ def turning(turn: Turn, centre: Float64) -> Transform:
     return Transform(rotation, turn.scale, np.zeros(3), centre)
 
 
-def yaw_of(motion: Transform) -> float:
-    """Return the angle [rad], counter-clockwise, by which a motion turns about the vertical."""
-    return float(np.arctan2(motion.rotation[1, 0], motion.rotation[0, 0]))
-
-
 def turned_as_voted(
     pairs: Pairs, turn: Turn, turned: Turned, settings: SearchSettings
 ) -> tuple[Pairs, Transform]:

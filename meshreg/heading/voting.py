@@ -13,7 +13,7 @@ with c_k the tile's centre from the centre of all. No hypothesis costs another t
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -29,7 +29,7 @@ from meshreg.heading.tile_surfaces import (
     surfaces_near,
 )
 from meshreg.offsets.correlate import Window
-from meshreg.records import Bool, Float32, Float64, OffsetAt, SurveyRaster
+from meshreg.records import RASTER_OF, Bool, Float32, Float64, OffsetAt, SurveyRaster
 from meshreg.settings import SearchSettings
 from meshreg.statistics import MAD_TO_SIGMA, biweight
 
@@ -247,10 +247,10 @@ def settled(pairs: Mapping[str, Pair], turn: Turn, guess: OffsetAt) -> Turn:
         With the whole yaw and stretch; as it was where the tiles say nothing more.
     """
     found = {}
-    for channel, name in (("terrain", "dem"), ("image", "ortho")):
+    for channel, name in RASTER_OF.items():
         reference, moving = pairs[name]
         reach = math.ceil(LEFT * turn.cell / moving.grid.cell)
-        tiles = surfaces_near(reference, moving, channel, guess, reach)  # type: ignore[arg-type]
+        tiles = surfaces_near(reference, moving, channel, guess, reach)
         if tiles is not None:
             found[channel] = tiles
     if not found:
@@ -305,8 +305,8 @@ def _best_at(
 ) -> Turn | None:
     """Return what both channels vote for, or the one that stands out more without the other."""
     found = {}
-    for channel, name in (("terrain", "dem"), ("image", "ortho")):
-        tiles = channel_surfaces(*pairs[name], channel, cell, radius, max_yaw + max_scale)  # type: ignore[arg-type]
+    for channel, name in RASTER_OF.items():
+        tiles = channel_surfaces(*pairs[name], channel, cell, radius, max_yaw + max_scale)
         if tiles is not None:
             found[channel] = tiles
     if not found:
@@ -372,7 +372,7 @@ def _seen(
 
 
 def _voted(
-    channels: list[str],
+    channels: Sequence[str],
     tiles: TileSurfaces,
     split: int,
     radius: float,

@@ -19,7 +19,16 @@ from meshreg.offsets import neutral
 from meshreg.offsets.channels import smooth
 from meshreg.offsets.correlate import Correlator, Window
 from meshreg.offsets.surface import Peak, find_peak, gap_at
-from meshreg.records import Finding, Float64, OffsetEstimate, Severity, SurveyRaster, Verdict
+from meshreg.records import (
+    RASTER_OF,
+    Channel,
+    Finding,
+    Float64,
+    OffsetEstimate,
+    Severity,
+    SurveyRaster,
+    Verdict,
+)
 from meshreg.settings import JudgeSettings, Settings
 
 EXCHANGES = ((True, False), (False, True), (True, True))  # down, across
@@ -62,7 +71,7 @@ class ChannelMap:
         Gaps of the maps whose tiles lie beside the wrong ones.
     """
 
-    name: neutral.Channel
+    name: Channel
     window: Window
     surface: Float64
     counts: Float64
@@ -149,9 +158,9 @@ def channel_maps(
         False: what chance does is not measured, which takes ten times as long.
     """
     maps: dict[str, ChannelMap] = {}
-    for channel, raster in (("terrain", "dem"), ("image", "ortho")):
+    for channel, raster in RASTER_OF.items():
         pair = rasters[raster]
-        found = channel_map(*pair, channel, radius, SCORED_OVERLAP, fields, chance=chance)  # type: ignore[arg-type]
+        found = channel_map(*pair, channel, radius, SCORED_OVERLAP, fields, chance=chance)
         if found is not None:
             maps[channel] = found
     return maps
@@ -236,7 +245,7 @@ def agree_distance(settings: JudgeSettings, dem: tuple[SurveyRaster, SurveyRaste
 def channel_map(
     reference: SurveyRaster,
     moving: SurveyRaster,
-    channel: neutral.Channel,
+    channel: Channel,
     radius: float,
     min_overlap: float,
     fields: neutral.FieldsOf = neutral.pair_fields,
@@ -244,11 +253,7 @@ def channel_map(
     chance: bool = True,
 ) -> ChannelMap | None:
     """Compute a channel's evidence and its null; None where there is nothing to compare."""
-    valid = (
-        (reference.valid, moving.valid)
-        if channel == "terrain"
-        else (reference.color_valid, moving.color_valid)
-    )
+    valid = reference.mask_of(channel), moving.mask_of(channel)
     if min(int(mask.sum()) for mask in valid) < 100:
         return None
     first, second = fields(reference, moving, channel)

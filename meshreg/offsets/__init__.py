@@ -25,7 +25,7 @@ from meshreg.offsets.error_bars import (
     whole_shift,
 )
 from meshreg.offsets.surface import Peak
-from meshreg.records import Bool, Float64, OffsetEstimate, SurveyRaster
+from meshreg.records import Bool, Channel, Float64, OffsetEstimate, SurveyRaster
 from meshreg.settings import Settings
 
 log = logging.getLogger(__name__)
@@ -37,7 +37,7 @@ class Estimator:
     """One method: the raster it looks at ("dem", "ortho" or "sift") and its function."""
 
     raster: Literal["dem", "ortho", "sift"]
-    channel: Literal["terrain", "image"]
+    channel: Channel
     run: Estimate
 
 
@@ -214,7 +214,7 @@ def _sigma(
 
 
 def _mask(raster: SurveyRaster, method: str) -> Bool:
-    return raster.valid if ESTIMATORS[method].channel == "terrain" else raster.color_valid
+    return raster.mask_of(ESTIMATORS[method].channel)
 
 
 def _no_image(reference: SurveyRaster, moving: SurveyRaster) -> str:

@@ -18,11 +18,10 @@ import numpy as np
 
 from meshreg.offsets.channels import grey, high_pass, local_normalised, orientation
 from meshreg.offsets.correlate import Complex, Correlator, overlap_floor
-from meshreg.records import Bool, Float64, Grid, SurveyRaster
+from meshreg.records import Bool, Channel, Float64, Grid, SurveyRaster
 from meshreg.statistics import MAD_TO_SIGMA
 
 _MANY = 1 << 16  # offsets: a quarter of them tells their spread as well
-Channel = Literal["terrain", "image"]
 Kind = Literal["scalar", "vector", "director"]
 Parts = tuple[Float64, ...]
 Step = tuple[int, int]

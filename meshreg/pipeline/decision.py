@@ -28,7 +28,7 @@ from meshreg.heading import (
 )
 from meshreg.height import Heights, fit_heights
 from meshreg.judge import Found, Stretch, findings, last_word
-from meshreg.offsets import ESTIMATORS, estimate_offset, neutral
+from meshreg.offsets import ESTIMATORS, estimate_offset
 from meshreg.offsets.correlate import Window
 from meshreg.offsets.neutral import FieldsOf, pair_fields
 from meshreg.pipeline.narrowing import (
@@ -42,6 +42,8 @@ from meshreg.pipeline.narrowing import (
 )
 from meshreg.pipeline.turned import as_delivered, check_heading_and_scale
 from meshreg.records import (
+    RASTER_OF,
+    Channel,
     Float64,
     Grid,
     OffsetEstimate,
@@ -377,7 +379,7 @@ def _within(radius: float, estimate: OffsetEstimate) -> OffsetEstimate:
 
 def _supporting(
     judgement: judging.Judgement, pairs: Pairs, settings: Settings
-) -> list[tuple[SurveyRaster, SurveyRaster, neutral.Channel]]:
+) -> list[tuple[SurveyRaster, SurveyRaster, Channel]]:
     """Return the rasters of the channels that put the best offset first.
 
     Others have tiles of chance.
@@ -385,11 +387,11 @@ def _supporting(
     best = judgement.best
     assert best is not None
     used = [
-        (*pairs["dem" if name == "terrain" else "ortho"], name)
-        for name in judgement.maps
+        (*pairs[RASTER_OF[part.name]], part.name)
+        for name, part in judgement.maps.items()
         if best.gaps[name] >= settings.judge.support_gap
     ]
-    return used or [(*pairs["dem"], "terrain")]  # type: ignore[return-value]
+    return used or [(*pairs["dem"], "terrain")]
 
 
 def _against_ties(
@@ -433,7 +435,7 @@ def _beside(estimate: OffsetEstimate, contradicted: str) -> OffsetEstimate:
 
 
 def _torn(
-    used: Sequence[tuple[SurveyRaster, SurveyRaster, neutral.Channel]],
+    used: Sequence[tuple[SurveyRaster, SurveyRaster, Channel]],
     offset: Float64,
     fields: FieldsOf,
 ) -> Tear | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -33,7 +34,8 @@ def looked_over(
         second_surface(moving, pairs["dem"][1], settings.seed),
     )
     dips = (posture(reference).dip, posture(moving).dip)
-    found = dataclasses.replace(found, layers=layers, dips=dips, tilt=_tilt(transform))
+    tilt = 0.0 if transform is None else math.degrees(transform.tilt)
+    found = dataclasses.replace(found, layers=layers, dips=dips, tilt=tilt)
     if last_word(decision.placed, findings(found)).verdict != "accepted":
         found = _explained(found, reference, moving, decision, settings, radius, pairs)
     return found, _counted(layers)
@@ -47,15 +49,6 @@ def _counted(layers: Sequence[Layer | None]) -> list[str]:
         for which, layer in zip(("reference", "moving"), layers, strict=True)
         if layer is not None and layer.cells >= 0.01
     ]
-
-
-def _tilt(transform: Transform | None) -> float:
-    """Return the angle by which a transform tilts the vertical [degrees]."""
-    if transform is None:
-        return 0.0
-    # the sine keeps a small angle that the cosine loses
-    up = transform.rotation[:, 2]
-    return float(np.rad2deg(np.arctan2(np.hypot(up[0], up[1]), up[2])))
 
 
 def _axes(

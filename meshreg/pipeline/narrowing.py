@@ -19,7 +19,7 @@ from meshreg.judge import SCORED_OVERLAP, ChannelMap
 from meshreg.offsets import neutral
 from meshreg.offsets.correlate import Correlator, Window
 from meshreg.raster.grid import coarsened
-from meshreg.records import Float64, Grid, SurveyRaster
+from meshreg.records import RASTER_OF, Channel, Float64, Grid, SurveyRaster
 from meshreg.settings import SearchSettings
 
 Pair = tuple[SurveyRaster, SurveyRaster]
@@ -107,8 +107,8 @@ def places(
     """
     cell = times * pairs["dem"][0].grid.cell
     seen: list[tuple[Window, Float64]] = []
-    for channel, name in (("terrain", "dem"), ("image", "ortho")):
-        found = _coarse_evidence(pairs[name], channel, cell, radius)  # type: ignore[arg-type]
+    for channel, name in RASTER_OF.items():
+        found = _coarse_evidence(pairs[name], channel, cell, radius)
         if found is not None:
             seen.append(found)
     if len(seen) == 2 and seen[0][1].shape == seen[1][1].shape:
@@ -172,10 +172,10 @@ def _counts_at(channel: ChannelMap, window: Window) -> Float64:
 
 
 def _coarse_evidence(
-    pair: Pair, channel: neutral.Channel, cell: float, radius: float
+    pair: Pair, channel: Channel, cell: float, radius: float
 ) -> tuple[Window, Float64] | None:
     """Evidence of a channel for each offset, on coarse cells of one lattice."""
-    masks = [r.valid if channel == "terrain" else r.color_valid for r in pair]
+    masks = [raster.mask_of(channel) for raster in pair]
     if min(int(mask.sum()) for mask in masks) < 100:
         return None
     times = max(1, round(cell / pair[0].grid.cell))

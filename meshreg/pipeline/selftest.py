@@ -262,7 +262,7 @@ def motions(
     rng = np.random.default_rng(seed)
     lengths = cell * np.geomspace(SHORTEST, LONGEST, count)
     here = whole.apply(centre)[:2] - centre[:2]
-    yaw_here = _yaw(whole)
+    yaw_here = whole.yaw
     drawn = []
     for length in lengths:
         heading, up, turn = rng.uniform((0.0, -UP * cell, -YAW), (2 * math.pi, UP * cell, YAW))
@@ -282,13 +282,9 @@ def _trial(motion: Transform, decision: Decision, whole: Transform, place: Float
     if found is not None:
         # the found transform takes the motion back, then does what `whole` does
         error = found.apply(motion.apply(place)) - whole.apply(place)
-        yaw_error = _yaw(found @ motion) - _yaw(whole)
+        yaw_error = (found @ motion).yaw - whole.yaw
         yaw_error = math.remainder(yaw_error, 2 * math.pi)
-    return Trial(motion.offset, _yaw(motion), judged.verdict, judged.reason, error, yaw_error)
-
-
-def _yaw(transform: Transform) -> float:
-    return math.atan2(transform.rotation[1, 0], transform.rotation[0, 0])
+    return Trial(motion.offset, motion.yaw, judged.verdict, judged.reason, error, yaw_error)
 
 
 def _bound(lengths: Float64) -> float:

@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from meshreg.heading import SMALL_YAW, Turn, yaw_of
+from meshreg.heading import SMALL_YAW, Turn
 from meshreg.records import Float64, OffsetAt, Transform
 from meshreg.refine import Refined
 from meshreg.settings import SearchSettings
@@ -27,7 +27,7 @@ def check_heading_and_scale(
     """
     scaled = ""
     notes: tuple[str, ...] = ()
-    turned = 0.0 if motion is None else yaw_of(motion)
+    turned = 0.0 if motion is None else motion.yaw
     if abs(turned) > SMALL_YAW:
         notes += (
             f"the moving survey's heading is off by {np.rad2deg(-yaw):+.2f}°: it was turned by "
@@ -67,7 +67,7 @@ def as_delivered(refined: Refined, motion: Transform) -> Refined:
         refined,
         pivot=pivot,
         offset=refined.pivot + refined.offset - pivot,
-        yaw=refined.yaw + yaw_of(motion),
+        yaw=refined.yaw + motion.yaw,
         tiles=tiles,
         offset_at=refined.offset_at and partial(_offset_at, refined.offset_at, motion),
     )

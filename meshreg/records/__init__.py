@@ -26,6 +26,8 @@ from meshreg.records.finding import (
     Tear,
 )
 from meshreg.records.grid import (
+    RASTER_OF,
+    Channel,
     Grid,
     SurveyRaster,
 )
@@ -51,7 +53,9 @@ from meshreg.records.warp import (
 )
 
 __all__ = [
+    "RASTER_OF",
     "Bool",
+    "Channel",
     "Finding",
     "Float32",
     "Float64",

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from meshreg.errors import UsageError
 from meshreg.records.arrays import NOTHING, Bool, Float32, Float64, UInt8, frozen, put
+
+Channel = Literal["terrain", "image"]
+# which raster of a pair each is of
+RASTER_OF: dict[Channel, str] = {"terrain": "dem", "image": "ortho"}
 
 
 @dataclass(frozen=True)
@@ -113,3 +117,7 @@ class SurveyRaster:
         seen = frozen(self.color_valid, np.bool_, shape, "SurveyRaster.color_valid")
         put(self, "color_valid", seen)
         put(self, "samples", frozen(self.samples, np.uint16, shape, "SurveyRaster.samples"))
+
+    def mask_of(self, channel: Channel) -> Bool:
+        """(H, W) bool: where a channel has data."""
+        return self.valid if channel == "terrain" else self.color_valid

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -56,6 +57,17 @@ class Transform:
         matrix[:3, :3] = self.linear
         matrix[:3, 3] = self.pivot + self.offset - self.linear @ self.pivot
         return matrix
+
+    @property
+    def yaw(self) -> float:
+        """Turn about the vertical, counterclockwise from above [rad]."""
+        return math.atan2(self.rotation[1, 0], self.rotation[0, 0])
+
+    @property
+    def tilt(self) -> float:
+        """Angle by which it tilts the vertical [rad]."""
+        east, north, up = self.rotation[:, 2]
+        return math.atan2(math.hypot(east, north), up)  # the cosine alone loses a small angle
 
     @classmethod
     def from_matrix(cls, matrix: Any, pivot: Any = (0.0, 0.0, 0.0)) -> Transform:

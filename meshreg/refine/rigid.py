@@ -16,7 +16,7 @@ import numpy as np
 
 from meshreg.offsets import neutral
 from meshreg.offsets.channels import smooth
-from meshreg.records import Bool, Finding, Float64, OffsetAt, SurveyRaster
+from meshreg.records import Bool, Channel, Finding, Float64, OffsetAt, SurveyRaster
 from meshreg.refine.tiles import (
     MAX_YAW,
     Overlap,
@@ -95,7 +95,7 @@ class Refined:
 
 
 def refine(
-    rasters: Sequence[tuple[SurveyRaster, SurveyRaster, neutral.Channel]],
+    rasters: Sequence[tuple[SurveyRaster, SurveyRaster, Channel]],
     offset: tuple[float, float],
     sigma: Float64,
     agree: float,

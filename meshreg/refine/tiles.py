@@ -19,7 +19,7 @@ from meshreg.offsets.channels import smooth
 from meshreg.offsets.correlate import Correlator, Window
 from meshreg.offsets.error_bars import whole_shift
 from meshreg.offsets.surface import find_peak
-from meshreg.records import Bool, Float64, Grid, OffsetAt, SurveyRaster
+from meshreg.records import Bool, Channel, Float64, Grid, OffsetAt, SurveyRaster
 
 MAX_YAW = np.deg2rad(1.0)
 HIGH_PASS = 2.0  # cells: finer than any warp, coarser than the noise of single cells
@@ -107,7 +107,7 @@ class Overlap:
 def correlated_tiles(
     reference: SurveyRaster,
     moving: SurveyRaster,
-    channel: neutral.Channel,
+    channel: Channel,
     offset: tuple[float, float],
     fields: neutral.FieldsOf = neutral.pair_fields,
     least_reach: int = 0,
@@ -197,7 +197,7 @@ def _tile_spectra(
 def spread_of_fields(
     reference: SurveyRaster,
     moving: SurveyRaster,
-    channel: neutral.Channel,
+    channel: Channel,
     tiles: TileOffsets,
     fields: neutral.FieldsOf = neutral.pair_fields,
 ) -> Float64:

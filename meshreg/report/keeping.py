@@ -199,7 +199,7 @@ def _keep_answer(registration: Registration, meta: dict[str, Any]) -> None:
         meta["answer"]["sigma"] = None if sigma is None else sigma.tolist()
     motion = registration.evidence.get("motion")
     if motion is not None:
-        yaw = math.degrees(math.atan2(motion.rotation[1, 0], motion.rotation[0, 0]))
+        yaw = math.degrees(motion.yaw)
         meta["turned"] = {"yaw_degrees": yaw, "scale": motion.scale}
 
 

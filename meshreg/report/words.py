@@ -253,7 +253,7 @@ def yaw_degrees(registration: Registration) -> float:
     transform = registration.transform
     if transform is None:
         return math.nan
-    return math.degrees(math.atan2(transform.rotation[1, 0], transform.rotation[0, 0]))
+    return math.degrees(transform.yaw)
 
 
 def tilt_degrees(registration: Registration) -> float:

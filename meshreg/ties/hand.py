@@ -259,7 +259,7 @@ def turn_degrees(turn: Transform | None) -> float | None:
     """Return the turn of a motion about the vertical [degrees, counterclockwise]."""
     if turn is None:
         return None
-    return math.degrees(math.atan2(turn.rotation[1, 0], turn.rotation[0, 0]))
+    return math.degrees(turn.yaw)
 
 
 def hand_document(hand: Hand) -> dict[str, Any]:

@@ -169,7 +169,7 @@ def _methods_motion(
     transform = registration.transform
     if transform is None:
         return None
-    yaw, scale = math.atan2(transform.rotation[1, 0], transform.rotation[0, 0]), transform.scale
+    yaw, scale = transform.yaw, transform.scale
     if turned is not None:
         yaw, scale = math.radians(turned[0]), turned[1]
     elif abs(yaw) <= _OWN_YAW and scale == 1.0:

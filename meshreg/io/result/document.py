@@ -40,7 +40,7 @@ def registration_document(registration: Registration) -> dict[str, Any]:
         matrix, pivot = transform.matrix.tolist(), transform.pivot.tolist()
         offset = dict(zip(("east", "north", "up"), transform.offset.tolist(), strict=True))
         scale = transform.scale
-        yaw = math.degrees(math.atan2(transform.rotation[1, 0], transform.rotation[0, 0]))
+        yaw = math.degrees(transform.yaw)
     covariance = registration.covariance
     document = {
         "schema": registration.schema,
