@@ -24,6 +24,8 @@ def show(registration: Registration, out: Path, voice: Terminal) -> None:
     color = _COLORS[registration.verdict]
     reason = registration.reason.strip()
     voice.say(f"[bold {color}]{registration.verdict.upper()}[/]: {escape(reason)}")
+    if registration.findings:
+        voice.say(f"findings: {', '.join(finding.code for finding in registration.findings)}")
     if registration.transform is not None:
         _print_offset(registration, voice)
     voice.out.print(_methods(registration))

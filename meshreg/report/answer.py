@@ -27,7 +27,10 @@ def verdict(result: Result) -> str:
         f'stroke-width="4" stroke-linecap="round"><circle cx="24" cy="24" r="21"/>'
         f"{_ICONS[r.verdict]}</svg>"
     )
-    head = f'<div class="word">{icon}<div><strong>{_WORDS[r.verdict]}</strong><p>{say(reason)}</p>'
+    codes = ", ".join(f"<code>{say(finding.code)}</code>" for finding in r.findings)
+    found = f'<p class="soft">Findings: {codes}</p>' if codes else ""
+    said = f"<strong>{_WORDS[r.verdict]}</strong><p>{say(reason)}</p>{found}"
+    head = f'<div class="word">{icon}<div>{said}'
     body = _numbers(result) + _next(result) + _validated(result)
     return (
         f'<section id="verdict" class="verdict {r.verdict}">{head}</div></div>'

@@ -261,7 +261,7 @@ def tilt_degrees(registration: Registration) -> float:
     transform = registration.transform
     if transform is None:
         return math.nan
-    return math.degrees(math.hypot(*transform.rotation[:2, 2]))  # its sine, for so small an angle
+    return math.degrees(transform.tilt)
 
 
 def _outcome(r: Registration) -> str:

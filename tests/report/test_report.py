@@ -22,8 +22,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_registration import EAST, NORTH, OFFSET, ground, made_registration, relief
 from PIL import Image
+from rich.console import Console
 
 from meshreg.cli import app as cli
+from meshreg.cli import console, result
 from meshreg.cli.reporting import add_report, keep_evidence, write_report
 from meshreg.errors import InputError, ResourceLimitError, UsageError
 from meshreg.io.result.evidence import NAME, read_evidence, write_evidence
@@ -247,6 +249,20 @@ def test_advice_follows_the_codes_of_the_findings(code: str, helps: str) -> None
     assert any(helps in step for step in steps)
     assert len(steps) == len(set(steps))
     assert words.next_steps(dataclasses.replace(found, verdict="accepted")) == ()
+
+
+def test_page_and_terminal_name_the_same_findings(tmp_path: Path) -> None:
+    findings = Finding("heights", "twice as high", values={"gain": 2.0}), Finding("border", "y")
+    registration = dataclasses.replace(made_registration("review"), findings=findings)
+    page = answer.verdict(Result(registration, {}))
+    assert "Findings: <code>heights</code>, <code>border</code>" in page
+    none = answer.verdict(Result(made_registration("accepted"), {}))
+    assert "Findings" not in none
+    terminal = console.Terminal(as_json=False)
+    terminal.out = Console(record=True, width=200, file=io.StringIO())
+    terminal.err = terminal.out
+    result.show(registration, tmp_path, terminal)
+    assert "findings: heights, border" in terminal.out.export_text()
 
 
 def test_advice_does_not_speak_of_a_distance_that_other_axes_explain() -> None:
