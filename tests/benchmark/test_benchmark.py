@@ -338,7 +338,7 @@ def test_a_run_goes_on_where_it_stopped(small: Any) -> None:
 
 def test_a_strange_folder_is_left_alone(tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("years of work")
-    with pytest.raises(UsageError, match="no folder of a benchmark"):
+    with pytest.raises(UsageError, match="not a folder of a benchmark"):
         run_benchmark(SMALL, tmp_path, overwrite=True)
     (tmp_path / "file").touch()
     with pytest.raises((UsageError, OutputError)):

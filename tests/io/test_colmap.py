@@ -324,7 +324,7 @@ def test_tables_of_positions(tmp_path, text, degrees):
         ("image,east,north,up\na,1,nan,3\n", "line 2"),
         ("image,east,up,x\na,1,2,3\n", "were looked for"),
         ("a 1 2\n", "too few columns"),
-        ("a\0b", "no table"),
+        ("a\0b", "not a table"),
     ],
 )
 def test_bad_tables(tmp_path, text, said):
@@ -493,7 +493,7 @@ def test_several_models_are_listed_with_their_sizes(tmp_path, scene):
 def test_no_model(tmp_path):
     with pytest.raises(InputError, match="no COLMAP model"):
         colmap.read(tmp_path, ReadOptions())
-    with pytest.raises(InputError, match="no folder"):
+    with pytest.raises(InputError, match="not a folder"):
         colmap.read(tmp_path / "nothing", ReadOptions())
 
 

@@ -391,7 +391,7 @@ def test_malformed_xml(tmp_path, points, root, text):
 
 
 @pytest.mark.parametrize(
-    ("rotation", "text"), [((0.0,) * 4, "no rotation"), (("one", 0, 0, 0), "no number")]
+    ("rotation", "text"), [((0.0,) * 4, "not a rotation"), (("one", 0, 0, 0), "not a number")]
 )
 def test_bad_poses(tmp_path, points, rotation, text):
     pose = pose_xml(rotation, (0.0, 0.0, 0.0)).replace("'one'", "one")

@@ -136,9 +136,9 @@ def test_a_world_file_that_contradicts_the_file_is_said(tmp_path):
         ("<PAMDataset><GeoTransform>1,2,3,4,5,nan</GeoTransform></PAMDataset>", "GeoTransform"),
         ('<PAMDataset><PAMRasterBand band="1"><Scale>x</Scale></PAMRasterBand></PAMDataset>', "Sc"),
         ('<!DOCTYPE a [<!ENTITY b "c">]><PAMDataset>&b;</PAMDataset>', "entities"),
-        ("<PAMDataset>", "no XML"),
-        ("\0\1", "no XML"),
-        ("", "no XML"),
+        ("<PAMDataset>", "not XML"),
+        ("\0\1", "not XML"),
+        ("", "not XML"),
         ("<PAMDataset><SRS>PROJCS[</SRS></PAMDataset>", "coordinate reference system"),
     ],
 )

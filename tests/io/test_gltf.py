@@ -365,7 +365,7 @@ def test_buffer_in_a_data_uri(tmp_path):
     survey = read(scene.gltf(tmp_path / "a.gltf", uri), ReadOptions())
     np.testing.assert_allclose(absolute(survey), enu(POINTS), atol=1e-6)
     scene.gltf(tmp_path / "a.gltf", uri[:-5] + "!!")
-    with pytest.raises(InputError, match="no base64"):
+    with pytest.raises(InputError, match="not base64"):
         read(tmp_path / "a.gltf", ReadOptions())
 
 
@@ -488,7 +488,7 @@ BROKEN = [
     (edit(scenes=[{"nodes": []}]), "shows no triangles"),
     (edit(nodes=[{"mesh": 5}]), r"meshes\[5\]"),
     (edit(nodes=[{"mesh": True}]), r"meshes\[True\]"),
-    (edit(nodes="x"), "no list of objects"),
+    (edit(nodes="x"), "not a list of objects"),
     (edit(nodes=[{"mesh": 0, "children": [0]}]), "reached twice"),
     (edit(nodes=[{"children": [1, 2]}, {"children": [2]}, {"mesh": 0}]), "reached twice"),
     (edit(nodes=[{"mesh": 0, "children": "no"}]), "children"),
@@ -503,8 +503,8 @@ BROKEN = [
     (edit("meshes", 0, "primitives", 0, mode=9), "mode 9"),
     (edit("meshes", 0, "primitives", 0, indices=9), r"accessors\[9\] of 2"),
     (edit("accessors", 0, count=5), "declares 5 elements of 12 bytes"),
-    (edit("accessors", 0, count=-4), "no count"),
-    (edit("accessors", 0, count=4.0), "no count"),
+    (edit("accessors", 0, count=-4), "not a count"),
+    (edit("accessors", 0, count=4.0), "not a count"),
     (edit("accessors", 0, count=2**40), "declares 1099511627776 elements|repeating"),
     (edit("accessors", 0, byteOffset=4), "from byte 4"),
     (edit("accessors", 0, componentType=5124), "component type 5124"),
@@ -523,11 +523,11 @@ BROKEN = [
     (edit("bufferViews", 0, byteStride=256), "byteStride 256"),
     (edit("bufferViews", 0, buffer=1), r"buffers\[1\]"),
     (edit("buffers", 0, byteLength=1 << 40), "declares 1099511627776 bytes"),
-    (edit("buffers", 0, byteLength="10"), "no count"),
+    (edit("buffers", 0, byteLength="10"), "not a count"),
     (edit(extensionsRequired=["KHR_draco_mesh_compression"]), "KHR_draco.*without compression"),
     (edit(extensionsRequired=["EXT_meshopt_compression"]), "EXT_meshopt"),
     (edit(extensionsRequired=["VENDOR_secret"]), "VENDOR_secret"),
-    (edit(extensionsRequired="KHR_x"), "no list"),
+    (edit(extensionsRequired="KHR_x"), "not a list"),
     (
         edit("meshes", 0, "primitives", 0, extensions={"KHR_draco_mesh_compression": {}}),
         "Draco|draco",
@@ -599,7 +599,7 @@ def test_depth_of_the_tree_is_capped(tmp_path, depth):
         (b"[" * 200_000 + b"]" * 200_000, "nested too deeply"),
         (b'{"asset": NaN}', "NaN"),
         (b'{"asset": ', "cannot be read"),
-        (b"[]", "no object"),
+        (b"[]", "not an object"),
         (b"\xff\xfe{\0}\0", "cannot be read"),
         (b'{"a": ' + b"9" * 5000 + b"}", "cannot be read"),
     ],

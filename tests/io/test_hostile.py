@@ -65,17 +65,22 @@ def test_points_come_whole_and_in_order_through_the_decoder(tmp_path, monkeypatc
     np.testing.assert_allclose(survey.geometry.points + survey.origin, points, atol=1e-6)
 
 
+def children():
+    """Processes that this one has started, with those of other tests."""
+    return set(Path(f"/proc/self/task/{os.getpid()}/children").read_text().split())
+
+
 def test_a_decoder_leaves_no_process_and_no_handle(tmp_path):
     laz_of(tmp_path / "a.laz", 500)
     gc.collect()  # what other tests have left open
     before = set(os.listdir("/proc/self/fd"))
+    running = children()
     for _ in range(3):
         read_survey(tmp_path / "a.laz")
         with pytest.raises(InputError):
             read_survey(DATA / "overflow.laz")
     assert set(os.listdir("/proc/self/fd")) == before
-    children = Path(f"/proc/self/task/{os.getpid()}/children").read_text().split()
-    assert children == []
+    assert children() <= running
 
 
 def test_memory_that_a_decoder_does_not_get_is_no_damage_of_the_file(tmp_path, monkeypatch):

@@ -160,7 +160,7 @@ def test_north_east_down_is_named_and_the_remedy_works(tmp_path, register):
     pair = written(tmp_path, "later.ply", NED)
     told = register(*pair)
     assert told.code == 4
-    assert told.codes == ["axes"]
+    assert told.codes == ["axes", "mirrored"]
     remedy = 'read with axes = "ned" in later.survey.toml beside it'
     for text in (told.terminal, told.page, told.record["reason"]):
         assert remedy in text

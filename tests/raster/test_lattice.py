@@ -280,7 +280,7 @@ def test_grids_that_do_not_fit_are_refused(other, words):
 
 @pytest.mark.parametrize(("cell", "lattice"), [(0.1, 0.25), (0.0, None), (-1.0, None), (1.0, 0.5)])
 def test_a_lattice_that_the_cell_does_not_divide_is_refused(cell, lattice):
-    with pytest.raises(UsageError, match="no multiple"):
+    with pytest.raises(UsageError, match="not a multiple"):
         survey_grid(sheet(lambda x, y: 0 * x), cell, lattice)
 
 

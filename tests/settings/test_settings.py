@@ -190,7 +190,7 @@ def test_a_pipe_or_a_device_is_refused_without_waiting(tmp_path):
     pipe = tmp_path / "pipe.toml"
     os.mkfifo(pipe)
     for path in (pipe, Path("/dev/zero"), tmp_path):
-        with pytest.raises(UsageError, match="no regular file"):
+        with pytest.raises(UsageError, match="not a regular file"):
             read_settings(path)
 
 

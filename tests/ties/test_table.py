@@ -206,7 +206,7 @@ def test_a_spreadsheet_with_decimal_commas(tmp_path):
     assert found.pairs[0].reference == (500000.25, 6000000.5)
     assert found.pairs[0].moving == (500001.5, 6000001.0)
     text = 'Label,X,Y,X_est,Y_est\nA,"1,234.5",2,3,4\n'
-    with pytest.raises(InputError, match="no coordinate"):
+    with pytest.raises(InputError, match="not a coordinate"):
         read_points(written(tmp_path / "thousands.csv", text))
 
 
