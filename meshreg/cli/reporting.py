@@ -34,10 +34,15 @@ def add_report(registration: Registration, folder: Path) -> None:
     except MeshregError:
         raise
     except Exception as error:
-        memory = isinstance(error, MemoryError)
-        why = "not enough memory" if memory else f"{type(error).__name__}: {error}"
-        LOG.warning("%s not made: %s", missing, why)
+        LOG.warning("%s not made: %s", missing, why_not(error))
         LOG.debug("why", exc_info=True)
+
+
+def why_not(error: Exception) -> str:
+    """Say in words why a page was not made."""
+    if isinstance(error, MemoryError):
+        return "not enough memory"
+    return f"{type(error).__name__}: {error}"
 
 
 def keep_evidence(registration: Registration, folder: Path) -> None:

@@ -212,14 +212,14 @@ def remake_report(out: Path) -> None:
     OutputError
         If it cannot be written.
     """
-    from meshreg.cli.reporting import write_report
+    from meshreg.cli.reporting import why_not, write_report
 
     try:
         write_report(out)
     except OutputError:
         raise
     except Exception as error:
-        LOG.warning("report.html was not made again: %s: %s", type(error).__name__, error)
+        LOG.warning("report.html was not made again: %s", why_not(error))
         LOG.debug("why", exc_info=True)
 
 
