@@ -13,7 +13,7 @@ import math
 import numpy as np
 
 from meshreg.records import Bool, Float64, Layer, Maps, Survey, SurveyRaster
-from meshreg.statistics import nmad
+from meshreg.statistics import half_scale, nmad
 
 MOST_POINTS = 400_000  # that are looked at
 MOST_VOTES = 4_000  # of the points off the surface, that say where a copy lies
@@ -60,6 +60,9 @@ def second_surface(survey: Survey, dem: SurveyRaster, seed: int = 0) -> Layer | 
         return None
     cells, where = np.unique(surface.cell_of(points), return_inverse=True)
     noise = nmad(rest)
+    larger = half_scale(rest)
+    if abs(float(np.median(rest))) > NEAR * larger:
+        noise = larger  # most points lie off the DEM, which shows a copy of fewer
     noise = max(noise, 0.02 * dem.grid.cell)
     deviation = np.hypot(noise, rough)
     off = np.abs(rest) > OFF * deviation

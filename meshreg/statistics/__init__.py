@@ -22,6 +22,7 @@ from meshreg.statistics.sandwich import (
 )
 from meshreg.statistics.scale import (
     MAD_TO_SIGMA,
+    half_scale,
     nmad,
 )
 from meshreg.statistics.weights import biweight
@@ -35,6 +36,7 @@ __all__ = [
     "block_sandwich",
     "design",
     "groups_of",
+    "half_scale",
     "least_trimmed_squares",
     "lever",
     "nmad",

@@ -12,3 +12,15 @@ MAD_TO_SIGMA = 1.4826
 def nmad(values: Float64) -> float:
     """Normalised median absolute deviation (Höhle and Höhle 2009, section 3.2)."""
     return MAD_TO_SIGMA * float(np.median(np.abs(values - np.median(values))))
+
+
+def half_scale(values: Float64) -> float:
+    """Return the standard deviation that the shortest half of the values tells.
+
+    Of normal values it is their sigma; of two groups that of the larger one, where the median
+    absolute deviation tells how far they lie apart. Rousseeuw and Leroy (1987), chapter 4.
+    """
+    ordered = np.sort(values)
+    half = (len(ordered) + 1) // 2
+    shortest = (ordered[half - 1 :] - ordered[: len(ordered) - half + 1]).min()
+    return float(shortest) / 1.349  # the quartiles of a normal distribution lie so far apart

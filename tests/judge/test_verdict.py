@@ -230,6 +230,17 @@ def test_a_second_copy_of_the_surface_is_found(step, relief):
     assert np.linalg.norm(told - step) < 0.4 * np.linalg.norm(step)
 
 
+@pytest.mark.parametrize("cell", [0.1, 0.2])
+def test_a_copy_of_every_second_point_is_found(cell):
+    """A third of all points: its distance is no measure of how rough the ground is."""
+    floor = seafloor.Seafloor.random(11, size=18.0)
+    points = survey(floor, half=5.0, cloud=True).geometry.points
+    step = np.array([0.3, 0.1, 0.25])
+    ghost = Survey("ghost", PointCloud(np.concatenate([points, points[::2] + step])))
+    layer = second_surface(ghost, rasterize(ghost, survey_lattice(ghost, cell)))
+    assert [finding.code for finding in findings(Found(layers=(layer, None)))] == ["layers"]
+
+
 def survey_lattice(one, cell=0.1):
     from meshreg.raster.grid import survey_grid
 
