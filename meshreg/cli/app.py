@@ -565,10 +565,11 @@ def validate(
     from meshreg.cli import validating
 
     request = validating.ValidateRequest(out, ties, reference_ortho, moving_ortho, radius, seed)
-    document = _done(
+    document, _ = _done(
         as_json,
         lambda voice, unfinished: validating.validate(request),
-        lambda document, voice: validating.show(document, out, voice),
+        lambda done, voice: validating.show(*done, out, voice),
+        lambda done: done[0],
     )
     return 0 if document["confirmed"] else 4
 

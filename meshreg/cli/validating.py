@@ -40,7 +40,7 @@ class ValidateRequest:
     seed: int = 0
 
 
-def validate(request: ValidateRequest) -> dict[str, Any]:
+def validate(request: ValidateRequest) -> tuple[dict[str, Any], str]:
     """Compare, write validation.json, .html and figures into OUT, say so in its report.html."""
     from meshreg.io.result.document import read_registration, to_json
     from meshreg.io.result.manifest import require_ours, write_into
@@ -82,8 +82,8 @@ def validate(request: ValidateRequest) -> dict[str, Any]:
     pages = (page.encode("utf-8"), to_json(document).encode("utf-8"))
     with in_place():
         write_into(request.out, {**pictures, **dict(zip(PAGES, pages, strict=True))})
-        remake_report(request.out)
-    return document
+        missing = remake_report(request.out)
+    return document, missing
 
 
 def read_pairs(
@@ -204,8 +204,13 @@ def _overlap(out: Path) -> Float64 | None:
         moving.close()
 
 
-def remake_report(out: Path) -> None:
+def remake_report(out: Path) -> str:
     """Make OUT/report.html again, so that it leads to the comparison; its failure loses nothing.
+
+    Returns
+    -------
+    str
+        Why it was not; empty where it was.
 
     Raises
     ------
@@ -219,8 +224,9 @@ def remake_report(out: Path) -> None:
     except OutputError:
         raise
     except Exception as error:
-        LOG.warning("report.html was not made again: %s", why_not(error))
         LOG.debug("why", exc_info=True)
+        return f"report.html was not made again: {why_not(error)}"
+    return ""
 
 
 def _png(figure: Any) -> bytes:
@@ -229,8 +235,8 @@ def _png(figure: Any) -> bytes:
     return stream.getvalue()
 
 
-def show(document: dict[str, Any], out: Path, voice: Terminal) -> None:
-    """Print the hand registration, and each answer's distance from it."""
+def show(document: dict[str, Any], missing: str, out: Path, voice: Terminal) -> None:
+    """Print the hand registration, each answer's distance from it, and why a page is missing."""
     from meshreg.report.style import method_name
 
     hand = document["hand"]
@@ -257,7 +263,7 @@ def show(document: dict[str, Any], out: Path, voice: Terminal) -> None:
         voice.say(f"No pairs in the {', '.join(document['weak_spots'])}.")
     for note in document["ties"]["notes"]:
         voice.say(f"[dim]note:[/] {escape(note)}")
-    voice.say(
-        f"Written to [bold]{escape(str(out))}[/]: validation.html, validation.json; "
-        "report.html leads there."
-    )
+    if missing:
+        voice.warn(missing)
+    leads = "" if missing else "; report.html leads there"
+    voice.say(f"Written to [bold]{escape(str(out))}[/]: validation.html, validation.json{leads}.")

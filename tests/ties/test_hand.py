@@ -418,3 +418,25 @@ def test_validate_writes_page_figures_and_document(tmp_path, capsys):
     write_ties(dataclasses.replace(far, crs="EPSG:3857"), tmp_path / "ties.csv")
     assert cli.run(["validate", str(out), str(tmp_path / "ties.csv")]) == 2
     assert cli.run(["validate", str(tmp_path / "none"), str(tmp_path / "ties.csv")]) == 2
+
+
+def test_a_report_that_is_not_made_again_is_said(tmp_path, capsys, monkeypatch):
+    registration, reference, moving = made((0.03, 0.0))
+    out = tmp_path / "OUT"
+    out.mkdir()
+    (out / "registration.json").write_text(to_json(registration_document(registration)))
+    write_ties(picked(reference, moving, registration.reference["crs"]), tmp_path / "ties.csv")
+    command = ["validate", str(out), str(tmp_path / "ties.csv")]
+    assert cli.run(command) == 0
+    assert "report.html leads there" in capsys.readouterr().out
+    before = (out / "report.html").read_bytes()
+
+    def starved(folder):
+        raise MemoryError
+
+    monkeypatch.setattr("meshreg.cli.reporting.write_report", starved)
+    assert cli.run(command) == 0
+    said = capsys.readouterr()
+    assert "report.html was not made again: not enough memory" in said.err
+    assert "leads there" not in said.out
+    assert (out / "report.html").read_bytes() == before
