@@ -11,18 +11,18 @@ import numpy as np
 from meshreg import judge as judging
 from meshreg.heading import Pairs
 from meshreg.judge import Found, findings, last_word, second_surface
+from meshreg.pipeline.answer import Answer
 from meshreg.pipeline.decision import Decision
 from meshreg.pipeline.far_pose import far_pose
 from meshreg.pipeline.postures import axes_after, other_axes, posture
-from meshreg.records import Layer, Survey, Transform
+from meshreg.records import Layer, Survey
 from meshreg.settings import Settings
 
 
 def looked_over(
-    found: Found,
+    answer: Answer,
     reference: Survey,
     moving: Survey,
-    transform: Transform | None,
     decision: Decision,
     settings: Settings,
     radius: float,
@@ -34,8 +34,9 @@ def looked_over(
         second_surface(moving, pairs["dem"][1], settings.seed),
     )
     dips = (posture(reference).dip, posture(moving).dip)
+    transform = answer.transform
     tilt = 0.0 if transform is None else math.degrees(transform.tilt)
-    found = dataclasses.replace(found, layers=layers, dips=dips, tilt=tilt)
+    found = dataclasses.replace(answer.found, layers=layers, dips=dips, tilt=tilt)
     if last_word(decision.placed, findings(found)).verdict != "accepted":
         found = _explained(found, reference, moving, decision, settings, radius, pairs)
     return found, _counted(layers)

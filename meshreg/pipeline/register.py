@@ -52,8 +52,7 @@ def register_pair(  # noqa: PLR0913
     progress : callable, optional
         Called with a stage's name and the fraction of it that is done.
     settled : callable, optional
-        Called with the transform once it stands, before the surveys are laid down and compared, if
-        that is all by which the moving survey will be moved: not where a warp is asked for.
+        Called with the transform once it stands, unless a warp is asked for.
     allow_same : bool
         Whether both surveys may come from the very same files.
 
@@ -77,20 +76,19 @@ def register_pair(  # noqa: PLR0913
     if degrees := in_no_metres(reference, moving):
         return unlike(reference, moving, settings, degrees, {}, [])
     settings, radius, notes = prepared(reference, moving, settings)
-    tell = progress or (lambda stage, fraction: None)
-    clock = Clock(tell)
+    clock = Clock(progress or (lambda stage, fraction: None))
     if apart := surveys_apart(reference, moving, radius):
         return unlike(reference, moving, settings, apart, clock.seconds, notes)
     masks = {"reference": reference_mask, "moving": moving_mask}
     with clock.stage("rasterize"):
-        pairs = rasterize_pair(reference, moving, settings, masks, tell)
+        pairs = rasterize_pair(reference, moving, settings, masks, clock.tell)
 
     def turned(turn: Turn) -> tuple[Pairs, Transform]:
         motion = turning(turn, moving.centre)
-        return rasterize_pair(reference, moving, settings, masks, tell, motion, pairs), motion
+        return rasterize_pair(reference, moving, settings, masks, clock.tell, motion, pairs), motion
 
     # heading; SIFT (III-B), terrain (III-C), mutual information (III-D); judged, refined, lifted
-    decision = decide(pairs, settings, radius, tell, manual, turned)
+    decision = decide(pairs, settings, radius, clock.tell, manual, turned)
     clock.seconds.update(decision.seconds)
     notes += decision.notes
     answer, decision = answer_of(reference, moving, decision, settings, pairs, clock)
@@ -101,12 +99,9 @@ def register_pair(  # noqa: PLR0913
         rasters = rasterize_registered(moving, transform, settings, masks, pairs)
     with clock.stage("internal"):
         laid = bent(decision.refined, transform, rasters, settings)
-    found, counted = looked_over(
-        answer.found, reference, moving, transform, decision, settings, radius, pairs
-    )
+    found, counted = looked_over(answer, reference, moving, decision, settings, radius, pairs)
     judgement = last_word(decision.placed, findings(found))
-    bend = [laid[0].summary] if laid[0].summary else []
-    notes += [*answer.notes, *bend, *counted]
+    notes += [*answer.notes, *filter(None, [laid[0].summary]), *counted]
     answer = dataclasses.replace(answer, found=found, notes=notes)
     both = reference, moving
     return registration_of(both, settings, decision, answer, judgement, laid, pairs, clock.seconds)
