@@ -78,7 +78,7 @@ def make_inputs(folder: Path) -> None:
     }
     for name, change in changes.items():
         meshreg.write_survey(_with_points(moving, change, name), folder / f"{name}.obj")
-    other = fault_jobs._sheet(Seafloor.random(99, size=6.0), 3, "other")
+    other = fault_jobs.sheet(Seafloor.random(99, size=6.0), 3, "other")
     meshreg.write_survey(other, folder / "other.obj")
     for name, seed in (("flat", 1), ("flat_too", 2)):
         noise = np.random.default_rng(seed)

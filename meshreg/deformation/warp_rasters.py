@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from meshreg.records import Float64, Grid, SurveyRaster, Warp
-from meshreg.statistics import biweight
+from meshreg.statistics import biweight, densest
 
 LEAST_TILES = 6
 _NODE = 16  # cells between the places where the inverse of a warp is solved
@@ -76,10 +76,9 @@ def common_value(values: Float64) -> float:
     """
     ordered = np.sort(values)
     third = len(ordered) // 3
-    width = ordered[third:] - ordered[: len(ordered) - third]
-    at = int(np.argmin(width))
+    at, width = densest(ordered, third + 1)
     middle = float(ordered[at : at + third + 1].mean())
-    spread = max(float(width[at]) / (2 * 0.4307), 1e-9)  # a third lies within 0.4307 deviations
+    spread = max(width / (2 * 0.4307), 1e-9)  # a third lies within 0.4307 deviations
     for _ in range(10):
         weight = biweight((ordered - middle) / (2.5 * spread))
         if not weight.any():

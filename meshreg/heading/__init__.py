@@ -19,19 +19,16 @@ from meshreg.heading.turned import (
     turning,
 )
 from meshreg.heading.voting import (
-    PLAIN_RATIO,
-    PLAIN_SCALE,
     SMALL_YAW,
     STANDS_OUT,
     Turn,
     coarse_turn,
     not_voted,
+    plainly_wrong,
     vote,
 )
 
 __all__ = [
-    "PLAIN_RATIO",
-    "PLAIN_SCALE",
     "SMALL_YAW",
     "STANDS_OUT",
     "Pairs",
@@ -41,6 +38,7 @@ __all__ = [
     "near_offset",
     "not_voted",
     "part_of",
+    "plainly_wrong",
     "turned_as_voted",
     "turning",
     "vote",

@@ -220,10 +220,15 @@ def _laid_together(
     return laid, (east, north), half + cell
 
 
+def plainly_wrong(scale: float, ratio: float) -> bool:
+    """Whether a scale is far from 1, and explains far more of the tiles than it leaves."""
+    return abs(scale - 1) >= PLAIN_SCALE and ratio >= PLAIN_RATIO
+
+
 def scaled(turn: Turn, settings: SearchSettings) -> Turn:
     """Return the turn with its stretch as the scale, where that is plainly wrong or asked for."""
     off = abs(turn.stretch - 1)
-    plain = off >= PLAIN_SCALE and turn.ratio >= PLAIN_RATIO
+    plain = plainly_wrong(turn.stretch, turn.ratio)
     if settings.max_scale > 0 and (plain or (settings.free_scale and off >= FINE_SCALE)):
         return replace(turn, scale=turn.stretch)
     return turn

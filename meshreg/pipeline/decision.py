@@ -15,14 +15,13 @@ import numpy as np
 
 from meshreg import judge as judging
 from meshreg.heading import (
-    PLAIN_RATIO,
-    PLAIN_SCALE,
     STANDS_OUT,
     Pairs,
     Turn,
     Turned,
     near_offset,
     not_voted,
+    plainly_wrong,
     turned_as_voted,
     vote,
 )
@@ -179,10 +178,10 @@ def _asked(
 ) -> Decision:
     """Decide; where nothing was proven, say which cells no turn was searched for on."""
     decision = _turned_if_voted(pairs, settings, radius, clock, manual, turned, beyond)
-    said = not_voted(pairs, settings.search, radius)
-    if not said or decision.motion is not None or decision.judgement.verdict == "accepted":
+    if decision.motion is not None or decision.judgement.verdict == "accepted":
         return decision
-    return dataclasses.replace(decision, notes=(*decision.notes, said))
+    said = not_voted(pairs, settings.search, radius)
+    return dataclasses.replace(decision, notes=(*decision.notes, said)) if said else decision
 
 
 def _turned_if_voted(
@@ -219,21 +218,13 @@ def _turned_if_voted(
     scaled = decision.scale != 1.0 and not settings.search.free_scale
     if decision.judgement.verdict != "accepted" and (decision.found.turned or scaled):
         delivered = in_frame(pairs, settings, radius, clock, manual, None)
+        finest = delivered.found.stretch  # the vote's own rule, of the finest tiles
+        plain = finest is not None and plainly_wrong(finest.value, finest.ratio)
         accepted = delivered.judgement.verdict == "accepted"
-        return delivered if accepted and not (scaled and _plain(delivered)) else decision
+        return delivered if accepted and not (scaled and plain) else decision
     if decision.judgement.verdict != "rejected":
         return decision
     return in_frame(pairs, settings, radius, clock, manual, turn)
-
-
-def _plain(decision: Decision) -> bool:
-    """Whether the finest tiles show a scale that is plainly wrong, as a vote would say it."""
-    stretch = decision.found.stretch
-    return (
-        stretch is not None
-        and abs(stretch.value - 1) >= PLAIN_SCALE
-        and stretch.ratio >= PLAIN_RATIO
-    )
 
 
 def _narrowed(

@@ -22,6 +22,7 @@ from meshreg.statistics.sandwich import (
 )
 from meshreg.statistics.scale import (
     MAD_TO_SIGMA,
+    densest,
     half_scale,
     nmad,
 )
@@ -34,6 +35,7 @@ __all__ = [
     "best_motion",
     "biweight",
     "block_sandwich",
+    "densest",
     "design",
     "groups_of",
     "half_scale",

@@ -21,6 +21,12 @@ def half_scale(values: Float64) -> float:
     absolute deviation tells how far they lie apart. Rousseeuw and Leroy (1987), chapter 4.
     """
     ordered = np.sort(values)
-    half = (len(ordered) + 1) // 2
-    shortest = (ordered[half - 1 :] - ordered[: len(ordered) - half + 1]).min()
-    return float(shortest) / 1.349  # the quartiles of a normal distribution lie so far apart
+    _, shortest = densest(ordered, (len(ordered) + 1) // 2)
+    return shortest / 1.349  # the quartiles of a normal distribution lie so far apart
+
+
+def densest(ordered: Float64, count: int) -> tuple[int, float]:
+    """Return where the shortest run of `count` of sorted values begins, and how long it is."""
+    width = ordered[count - 1 :] - ordered[: len(ordered) - count + 1]
+    at = int(np.argmin(width))
+    return at, float(width[at])

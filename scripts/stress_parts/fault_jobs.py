@@ -51,7 +51,7 @@ def make_inputs(folder: Path) -> None:
     floor = Seafloor.random(11, size=6.0)
     later = floor.changed(12, 0.1).moved(-0.2, 0.1)
     for name, ground, seed in (("reference", floor, 1), ("moving", later, 2)):
-        survey = _sheet(ground, seed, name)
+        survey = sheet(ground, seed, name)
         for kind in FORMATS if name == "moving" else ("obj",):
             meshreg.write_survey(_as_cloud(survey, kind), folder / f"{name}.{kind}")
         _write_maps(ground, seed, folder, name)
@@ -61,7 +61,7 @@ def make_inputs(folder: Path) -> None:
     (folder / "ties.csv").write_text("\n".join(lines) + "\n")
 
 
-def _sheet(ground: Any, seed: int, name: str) -> Any:
+def sheet(ground: Any, seed: int, name: str) -> Any:
     from meshreg.records import Mesh, Survey, Texture
 
     raster = ground.raster(0.05, 2.0, noise=0.002, seed=seed)

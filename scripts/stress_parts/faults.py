@@ -56,6 +56,11 @@ ERRNOS = {
 MEMORY = "MemoryError"
 FULL = "full disk"
 LARGE = "file too large"
+# What is said where there is not enough memory for a page, and what is not there then.
+PAGES = {
+    "report.html was not made: ": "not new: out/report.html",
+    "evidence.npz and report.html were not made: ": "not new: out/evidence.npz out/report.html",
+}
 SIZES = 24  # of full disks, and of files' limits, for each job
 Snapshot = dict[str, str]
 
@@ -444,13 +449,10 @@ def _wrong(
         allowed.add(5)
     if ended.code not in allowed:
         return f"exit code {ended.code}"
-    for what in ("report.html was", "evidence.npz and report.html were"):
-        left_out = "not new: " + " ".join(
-            f"out/{name}" for name in what.split() if name.endswith((".npz", ".html"))
-        )
-        named = fault == MEMORY and ended.code == usual.code and f"{what} not made" in said
-        if named and state == "lost" and beside.endswith(left_out):
-            beside = beside.removesuffix(left_out).strip()  # a page is no reason to lose a result
+    for what, missing in PAGES.items():  # a page is no reason to lose a result
+        named = fault == MEMORY and ended.code == usual.code and what in said
+        if named and state == "lost" and beside.endswith(missing):
+            beside = beside.removesuffix(missing).strip()
             return f"left beside: {beside}" if beside else ""
     if state == "lost":
         return f"neither the old result nor the new one: {beside}"
